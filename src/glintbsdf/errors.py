@@ -1,0 +1,27 @@
+"""The one sentence in which every parameter error is told: who, which, what is allowed, what came."""
+
+from __future__ import annotations
+
+
+class ParameterError(ValueError):
+    """A parameter of a plugin or function has a value that is not allowed."""
+
+
+def describe(value: object) -> str:
+    """Show a value as it is quoted in an error: strings in double quotes, everything else by repr."""
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def check(condition: bool, owner: str, parameter: str, requirement: str, got: object) -> None:
+    """Raise :class:`ParameterError` unless ``condition`` holds.
+
+    The message reads ``owner: "parameter" must be requirement (got value)``, for example
+    ``glint_manifold: "kernel" must be one of gaussian, disk, box (got "gauss")``.
+    """
+    if not condition:
+        raise ParameterError(f'{owner}: "{parameter}" must be {requirement} (got {describe(got)})')
+
+
+def check_choice(owner: str, parameter: str, value: object, choices: tuple[str, ...]) -> None:
+    """Raise :class:`ParameterError` unless ``value`` is one of ``choices``."""
+    check(value in choices, owner, parameter, "one of " + ", ".join(choices), value)
