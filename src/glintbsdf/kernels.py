@@ -1,0 +1,165 @@
+"""Footprint kernels k(u − x) on the texel lattice.
+
+A footprint is a Gaussian in UV (``footprint.py``); a P-NDF weighs the texels it covers with one of three
+kernels, all defined by the Mahalanobis distance ρ in the whitened footprint and all of unit integral:
+
+* ``gaussian``: exp(−ρ²/2), cut at ρ ≤ 3 and renormalised;
+* ``disk``: uniform over ρ ≤ 1.5;
+* ``box``: uniform over |Δu| ≤ 1.5 σ_u, |Δv| ≤ 1.5 σ_v, with σ_u, σ_v the standard deviations along the axes.
+
+Positions are in texels: texel (row i, column j) has its centre at (j, i).
+"""
+
+from __future__ import annotations
+
+from math import exp, pi
+
+import drjit as dr
+import mitsuba as mi
+
+from .errors import check_choice
+from .footprint import Footprint
+
+KERNELS = ("gaussian", "disk", "box")
+
+#: Reach of each kernel in standard deviations.
+REACH = {"gaussian": 3.0, "disk": 1.5, "box": 1.5}
+
+#: Standard deviation (texels) of the isotropic Gaussian added to every footprint, so that a footprint of no
+#: extent still has a density: the "finest answer". A footprint of half a texel widens by 0.01 %.
+SIGMA_MIN = 1 / 128
+
+#: Largest standard deviation (maps) of a footprint. The periodic sum of a Gaussian one map wide is uniform to
+#: 5e-9 (Poisson summation), 2e-3 with its cut at ρ = 3; a wider one only costs more.
+SIGMA_MAX = 1.0
+
+
+def limit_extent(du, dv):
+    """Limit the standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX` along its principal axes.
+
+    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns the two limited vectors. Works on the factor, never on Σ⁻¹, so
+    that a footprint 1000 times longer than wide keeps its width.
+    """
+    a = dr.fma(du.x, du.x, dv.x * dv.x)
+    c = dr.fma(du.y, du.y, dv.y * dv.y)
+    b = dr.fma(du.x, du.y, dv.x * dv.y)
+    mean, difference = 0.5 * (a + c), 0.5 * (a - c)
+    radius = dr.safe_sqrt(dr.fma(difference, difference, b * b))
+    # The eigenvector of the larger eigenvalue, from the row of Σ − λ₂ I that does not cancel.
+    major = dr.select(
+        difference >= 0, mi.Vector2f(difference + radius, b), mi.Vector2f(b, radius - difference)
+    )
+    length = dr.norm(major)
+    major = dr.select(length > 0, major / dr.maximum(length, dr.smallest(mi.Float)), mi.Vector2f(1, 0))
+    minor = mi.Vector2f(-major.y, major.x)
+
+    def shorten(variance):
+        return 1 - dr.minimum(SIGMA_MAX * dr.rsqrt(dr.maximum(variance, SIGMA_MAX**2)), 1)
+
+    shorten_major, shorten_minor = shorten(mean + radius), shorten(mean - radius)
+
+    def limited(d):
+        return d - shorten_major * dr.dot(major, d) * major - shorten_minor * dr.dot(minor, d) * minor
+
+    return limited(du), limited(dv)
+
+
+def difference_of_products(a, b, c, d):
+    """a b − c d without cancellation (Kahan, with one fused multiply-add for the rounding error)."""
+    cd = c * d
+    return dr.fma(a, b, -cd) + dr.fma(-c, d, cd)
+
+
+class TexelKernel:
+    """The kernel of one footprint per lane, over a map of ``width`` × ``height`` texels.
+
+    Σ is factored row first: with σ_v the standard deviation over rows, ``shear`` = Σ_uv/Σ_vv and σ_{u|v} the
+    standard deviation of u given v,
+
+        ρ² = (Δv/σ_v)² + ((Δu − shear Δv)/σ_{u|v})².
+
+    The determinant comes from the factor's cross product, so rank-one and 1000:1 footprints keep their digits.
+
+    Attributes:
+        mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
+        reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
+    """
+
+    def __init__(self, kernel: str, footprint: Footprint, width: int, height: int, wrap_mode: str):
+        check_choice("TexelKernel", "kernel", kernel, KERNELS)
+        self.kernel = kernel
+        uv = footprint.uv
+        if wrap_mode == "clamp":
+            # The strips beyond the edges are constant: a footprint six maps outside sees what is there for ever.
+            uv = dr.clip(uv, -6.0, 7.0)
+        else:
+            uv = uv - dr.floor(uv)
+        size = mi.Vector2f(width, height)
+        self.mean = mi.Point2f(dr.fma(uv, size, -0.5))
+
+        du, dv = limit_extent(footprint.du, footprint.dv)
+        du, dv = du * size, dv * size
+        s2 = SIGMA_MIN**2
+        variance_u = dr.fma(du.x, du.x, dr.fma(dv.x, dv.x, s2))
+        variance_v = dr.fma(du.y, du.y, dr.fma(dv.y, dv.y, s2))
+        covariance = dr.fma(du.x, du.y, dv.x * dv.y)
+        cross = difference_of_products(du.x, dv.y, du.y, dv.x)
+        determinant = dr.fma(cross, cross, s2 * (variance_u + variance_v - s2))
+
+        self.sigma_u, self.sigma_v = dr.sqrt(variance_u), dr.sqrt(variance_v)
+        self.shear = covariance / variance_v
+        self.sigma_u_given_v = dr.sqrt(determinant / variance_v)
+        reach = REACH[kernel]
+        self.reach_u, self.reach_v = reach * self.sigma_u, reach * self.sigma_v
+        if kernel == "box":
+            self.peak = dr.rcp(4 * self.reach_u * self.reach_v)
+        else:
+            self.inverse_u_given_v, self.inverse_v = dr.rcp(self.sigma_u_given_v), dr.rcp(self.sigma_v)
+            mass = 2 * pi * (1 - exp(-0.5 * reach**2)) if kernel == "gaussian" else pi * reach**2
+            self.peak = self.inverse_u_given_v * self.inverse_v / mass
+            # Row at which the ellipse reaches furthest to the right.
+            self.row_of_reach_u = reach * covariance / self.sigma_u
+
+    def value(self, offset):
+        """k(Δ) in 1/texel², for ``offset`` Δ = u − x in texels."""
+        if self.kernel == "box":
+            inside = (dr.abs(offset.x) <= self.reach_u) & (dr.abs(offset.y) <= self.reach_v)
+            return dr.select(inside, self.peak, 0)
+        u = dr.fma(-self.shear, offset.y, offset.x) * self.inverse_u_given_v
+        v = offset.y * self.inverse_v
+        rho2 = dr.fma(u, u, v * v)
+        inside = rho2 <= REACH[self.kernel] ** 2
+        if self.kernel == "disk":
+            return dr.select(inside, self.peak, 0)
+        return dr.select(inside, self.peak * dr.exp(-0.5 * rho2), 0)
+
+    def sample(self, sample):
+        """Draw an offset Δ (texels) with density k from ``sample`` in [0, 1)²."""
+        reach = REACH[self.kernel]
+        if self.kernel == "box":
+            return mi.Vector2f(
+                self.reach_u * dr.fma(2, sample.x, -1), self.reach_v * dr.fma(2, sample.y, -1)
+            )
+        if self.kernel == "disk":
+            rho = reach * dr.sqrt(sample.x)
+        else:
+            rho = dr.sqrt(-2 * dr.log(1 - sample.x * (1 - exp(-0.5 * reach**2))))
+        sin_phi, cos_phi = dr.sincos(2 * pi * sample.y)
+        v = self.sigma_v * rho * sin_phi
+        return mi.Vector2f(dr.fma(self.shear, v, self.sigma_u_given_v * rho * cos_phi), v)
+
+    def row_extent(self, top, bottom):
+        """Extent (left, right) in texels, relative to the mean, of the support within rows [top, bottom].
+
+        ``top``, ``bottom``: relative to the mean too. Exact for the ellipse and for the box.
+        """
+        if self.kernel == "box":
+            return -self.reach_u, self.reach_u
+
+        def edge(sign):
+            v = dr.clip(sign * self.row_of_reach_u, top, bottom)
+            z = v * self.inverse_v
+            half = self.sigma_u_given_v * dr.safe_sqrt(REACH[self.kernel] ** 2 - z * z)
+            return dr.fma(self.shear, v, sign * half)
+
+        return edge(-1), edge(1)
