@@ -20,6 +20,11 @@ from ..kernels import KERNELS, TexelKernel
 # ----------------------------------------------------------------------------------------------------------------
 
 
+def floor_int(x):
+    """The largest integer ≤ x, as ``mi.Int``."""
+    return mi.Int(dr.floor(x))
+
+
 def cross(a, b):
     """z component of the cross product of two vectors of the plane."""
     return dr.fma(a.x, b.y, -(a.y * b.x))
@@ -100,7 +105,7 @@ class Manifold:
         if self.normal_map.wrap_mode == "clamp":
             return dr.clip(i, 0, n - 1)
         if self.normal_map.wrap_mode == "mirror":
-            i = i - dr.floor2int(mi.Int, mi.Float(i) / (2 * n)) * (2 * n)
+            i = i - mi.Int(dr.floor(mi.Float(i) / (2 * n))) * (2 * n)
             return dr.minimum(i, 2 * n - 1 - i)
         i = i % n
         return dr.select(i < 0, i + n, i)
@@ -119,10 +124,10 @@ class Manifold:
         kernel = self.texel_kernel(footprint)
         active = mi.Bool(active)
         density = mi.Float(0)
-        i = dr.floor2int(mi.Int, kernel.mean.y - kernel.reach_v)
-        i_end = dr.floor2int(mi.Int, kernel.mean.y + kernel.reach_v)
-        j_first = dr.floor2int(mi.Int, kernel.mean.x - kernel.reach_u)
-        j_end = dr.floor2int(mi.Int, kernel.mean.x + kernel.reach_u)
+        i = floor_int(kernel.mean.y - kernel.reach_v)
+        i_end = floor_int(kernel.mean.y + kernel.reach_v)
+        j_first = floor_int(kernel.mean.x - kernel.reach_u)
+        j_end = floor_int(kernel.mean.x + kernel.reach_u)
         j = mi.Int(j_first)
         while dr.hint(active & (i <= i_end), max_iterations=-1, exclude=[self, kernel]):
             n = self.quad_normals(i, j, active)
@@ -137,7 +142,7 @@ class Manifold:
     def sample(self, footprint, sample1, sample2, active=True):
         kernel = self.texel_kernel(footprint)
         u = kernel.mean + kernel.sample(sample2)
-        j, i = dr.floor2int(mi.Int, u.x), dr.floor2int(mi.Int, u.y)
+        j, i = floor_int(u.x), floor_int(u.y)
         l1, l2 = u.x - j, u.y - i
         upper, lower = quad_triangles(*self.quad_normals(i, j, active), self.epsilon)
         in_upper = l1 + l2 < 1
