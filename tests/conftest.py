@@ -1,0 +1,71 @@
+"""Options and fixtures that all tests share: the variant, a clean Dr.Jit, a cache of their own."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import pytest
+
+import glintbsdf  # noqa: F401  (first: it names the LLVM library that Dr.Jit is to load)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+# Besides the variant of the run: several wavelengths per ray, one channel, Mueller matrices.
+OTHER_COLOURS = ("spectral", "mono", "spectral_polarized")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--variant",
+        default="llvm_ad_rgb",
+        help="Mitsuba variant the tests run in (default: llvm_ad_rgb)",
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "each_variant" in metafunc.fixturenames:
+        backend = metafunc.config.getoption("--variant").split("_", 1)[0]
+        variants = [f"{backend}_ad_{colour}" for colour in OTHER_COLOURS]
+        metafunc.parametrize("each_variant", variants, indirect=True)
+
+
+def _activate(name: str) -> str:
+    """Choose the variant ``name``; skip the test where it was not compiled or has no device."""
+    if name not in mi.variants():
+        pytest.skip(f"this Mitsuba has no variant {name}")
+    backend = dr.JitBackend.CUDA if name.startswith("cuda") else dr.JitBackend.LLVM
+    if not name.startswith("scalar") and not dr.has_backend(backend):
+        pytest.skip(f"no device for {name}")
+    mi.set_variant(name)
+    return name
+
+
+@pytest.fixture
+def variant(request: pytest.FixtureRequest) -> str:
+    """Activate the variant of the run (``--variant``) and return its name."""
+    return _activate(request.config.getoption("--variant"))
+
+
+@pytest.fixture
+def each_variant(request: pytest.FixtureRequest) -> str:
+    """Run the test once in a spectral, a monochromatic and a polarised variant; for short tests."""
+    return _activate(request.param)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the tests away from the user's cache of built structures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GLINTBSDF_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _flush_drjit() -> Iterator[None]:
+    """Free what a test left behind, so that the memory of one run does not add up."""
+    yield
+    if mi.variant() is not None and not mi.variant().startswith("scalar"):
+        gc.collect()
+        dr.flush_malloc_cache()
