@@ -1,0 +1,314 @@
+"""Make every mesh, environment and normal map of the scenes: ``python scenes/make_assets.py``.
+
+The results are committed, so a fresh clone renders without this script. Everything is computed in
+float64 from formulas and fixed seeds; nothing is downloaded. Lengths are scene units, y is up.
+
+UV coordinates measure lengths along the surface (the curved patch apart, whose UVs fill the unit
+square), so that one ``uv_scale`` gives every part of a scene the same size of texel.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenEXR
+from scipy.interpolate import CubicSpline
+
+from glintbsdf import maps
+
+MAP_SIZE = 1024
+
+
+# --------------------------------------------------------------------------------------------------
+# Meshes
+# --------------------------------------------------------------------------------------------------
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh: positions, unit normals (N, 3), UVs (N, 2), triangles (M, 3) of indices."""
+
+    positions: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    triangles: np.ndarray
+
+
+def write_ply(filename: Path, mesh: Mesh) -> None:
+    """Write ``mesh`` as a binary little-endian PLY with the property names that Mitsuba reads."""
+    properties = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
+    vertices = np.hstack([mesh.positions, mesh.normals, mesh.uvs]).astype("<f4")
+    faces = np.empty(len(mesh.triangles), dtype=[("count", "u1"), ("indices", "<i4", 3)])
+    faces["count"], faces["indices"] = 3, mesh.triangles
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in properties]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    content = "\n".join(header).encode("ascii") + b"\n" + vertices.tobytes() + faces.tobytes()
+    filename.write_bytes(content)
+
+
+def parametric(
+    position: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    s: np.ndarray,
+    t: np.ndarray,
+    uv: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> Mesh:
+    """Tessellate ``position(s, t)`` on the grid of the parameter values ``s`` × ``t``.
+
+    Normals are the normalised ∂p/∂s × ∂p/∂t by central differences of the formula itself, not of
+    the mesh, so they are smooth at every tessellation. A pole (∂p/∂s = 0) must not be a grid value.
+    """
+    step = 1e-5
+    s, t = np.meshgrid(s, t)
+    dp_ds = position(s + step, t) - position(s - step, t)
+    dp_dt = position(s, t + step) - position(s, t - step)
+    normals = np.cross(dp_ds, dp_dt)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+
+    rows, columns = s.shape
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, below, opposite = corner + 1, corner + columns, corner + columns + 1
+    triangles = np.concatenate([
+        np.stack([corner, right, below], axis=1), np.stack([opposite, below, right], axis=1)])
+    flat = (a.reshape(-1, a.shape[-1]) for a in (position(s, t), normals, uv(s, t)))
+    return Mesh(*flat, triangles)
+
+
+def lathe(
+    outline: CubicSpline, *, start: float, end: float, segments: int, rings: int, repeats: int = 0
+) -> Mesh:
+    """Turn ``outline``, which maps arc length to (radius, height), about the y axis.
+
+    Where ``repeats`` is positive, u runs from 0 to ``repeats`` around the axis and v along the
+    outline. Where it is 0 the UVs are polar about the axis (arc length and angle), which has no
+    pole: right for lids and bottoms.
+    """
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        radius, height = np.moveaxis(outline(t), -1, 0)
+        return np.stack([radius * np.cos(s), height, -radius * np.sin(s)], axis=-1)
+
+    def uv(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        if repeats:
+            return np.stack([s * repeats / (2 * np.pi), t], axis=-1)
+        return np.stack([t * np.cos(s), -t * np.sin(s)], axis=-1)
+
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    return parametric(position, angle, np.linspace(start, end, rings + 1), uv)
+
+
+def tube(path: CubicSpline, radius: Callable, *, length: float, segments: int, rings: int) -> Mesh:
+    """Sweep a circle of ``radius(t)`` along ``path(t)``, a curve in the plane z = 0, by arc length.
+
+    The curve stays in its plane, so its normal in the plane and the z axis frame it without twist.
+    """
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        tangent = path(t, 1)
+        tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+        across = np.stack([-tangent[..., 1], tangent[..., 0], np.zeros_like(t)], axis=-1)
+        beside = np.cross(tangent, across)
+        r = radius(t)[..., None]
+        return path(t) + r * (np.cos(s)[..., None] * across + np.sin(s)[..., None] * beside)
+
+    mean_girth = 2 * np.pi * float(np.mean(radius(np.linspace(0, length, 64))))
+
+    def uv(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.stack([s / (2 * np.pi) * mean_girth, t], axis=-1)
+
+    angle = np.linspace(0, 2 * np.pi, segments + 1)
+    return parametric(position, angle, np.linspace(0, length, rings + 1), uv)
+
+
+def spline(points: list[tuple[float, ...]]) -> tuple[CubicSpline, float]:
+    """A smooth curve through ``points`` parametrised by arc length, and that length.
+
+    The first spline runs by chord length; resampling it at equal arc lengths gives the second.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    chord = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    rough = CubicSpline(chord, points)
+    t = np.linspace(0, chord[-1], 4001)
+    samples = rough(t)
+    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(samples, axis=0), axis=1))])
+    knots = np.linspace(0, arc[-1], 65)
+    return CubicSpline(knots, rough(np.interp(knots, arc, t))), float(arc[-1])
+
+
+def curved_patch() -> Mesh:
+    """A sail-like square dome, about 1.26 wide and 0.5 high, above the origin; UVs [0, 1]²."""
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        x, z = 1.26 * s - 0.63, 1.26 * t - 0.63
+        y = 0.16 + 0.62 * np.cos(1.3 * x) * np.cos(1.3 * z) + 0.10 * x * z
+        return np.stack([x, y, z], axis=-1)
+
+    grid = np.linspace(0, 1, 49)
+    # t runs along +z and s along +x: swap them, so that the normals point up.
+    return parametric(lambda s, t: position(t, s), grid, grid, lambda s, t: np.stack([t, s], -1))
+
+
+KETTLE_AXIS_EPSILON = 1e-3  # radius of the hole at a pole, much smaller than a pixel
+
+
+def kettle_body() -> Mesh:
+    """The kettle's belly from the table (y = 0) to the rim of its lid (radius 0.46)."""
+    outline, length = spline([(0.78, 0.0), (0.90, 0.03), (0.985, 0.15), (1.0, 0.33), (0.95, 0.55),
+                              (0.83, 0.78), (0.65, 0.97), (0.52, 1.06), (0.47, 1.085),
+                              (0.46, 1.06)])
+    # The outline runs upwards and the angle about +y: the normals point outwards.
+    return lathe(outline, start=0.0, end=length, segments=96, rings=64, repeats=6)
+
+
+def kettle_lid() -> Mesh:
+    """A shallow dome that rests in the rim."""
+    outline, length = spline([(KETTLE_AXIS_EPSILON, 1.20), (0.12, 1.195), (0.25, 1.17),
+                              (0.36, 1.13), (0.425, 1.095), (0.45, 1.065)])
+    return flipped(lathe(outline, start=0.0, end=length, segments=72, rings=24))
+
+
+def kettle_knob() -> Mesh:
+    """The lid's knob, black."""
+    outline, length = spline([(KETTLE_AXIS_EPSILON, 1.42), (0.06, 1.415), (0.115, 1.375),
+                              (0.12, 1.33), (0.075, 1.28), (0.05, 1.24), (0.06, 1.19)])
+    return flipped(lathe(outline, start=0.0, end=length, segments=48, rings=24))
+
+
+def kettle_spout() -> Mesh:
+    """A tapering spout towards +x."""
+    path, length = spline([(0.74, 0.34, 0), (1.02, 0.45, 0), (1.22, 0.68, 0), (1.36, 0.95, 0),
+                           (1.54, 1.12, 0)])
+    return tube(path, lambda t: 0.085 + 0.135 * (1 - t / length) ** 2,
+                length=length, segments=48, rings=40)
+
+
+def kettle_handle() -> Mesh:
+    """The handle, an arch over the lid in the plane z = 0, black."""
+    path, length = spline([(0.73, 0.90, 0), (0.83, 1.20, 0), (0.70, 1.56, 0), (0.36, 1.78, 0),
+                           (0, 1.84, 0), (-0.36, 1.78, 0), (-0.70, 1.56, 0), (-0.83, 1.20, 0),
+                           (-0.73, 0.90, 0)])
+    return tube(path, lambda t: 0.04 + 0.03 * np.exp(-((t / length - 0.5) / 0.22) ** 4),
+                length=length, segments=32, rings=72)
+
+
+def cove() -> Mesh:
+    """A photographer's sweep: the floor y = 0 that bends up, in a quarter circle, into a wall."""
+    floor, bend, wall = 9.0, 2.5, 3.0
+    arc = bend * np.pi / 2
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        angle = np.clip((t - floor) / bend, 0, np.pi / 2)
+        z = 7.0 - np.minimum(t, floor) - bend * np.sin(angle)
+        y = bend * (1 - np.cos(angle)) + np.maximum(t - floor - arc, 0)
+        return np.stack([s, y, z], axis=-1)
+
+    return parametric(position, np.array([-9.0, 9.0]), np.linspace(0, floor + arc + wall, 65),
+                      lambda s, t: np.stack([s, t], axis=-1))
+
+
+def plate() -> Mesh:
+    """A square plate, side 2 about the origin, with one stamped boss inside a stamped ring."""
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        r = np.hypot(s, t)
+        boss = 0.10 * np.exp(-((r / 0.28) ** 4))
+        ring = -0.035 * np.exp(-(((r - 0.55) / 0.07) ** 2))
+        return np.stack([s, boss + ring, -t], axis=-1)
+
+    grid = np.linspace(-1, 1, 97)
+    return parametric(position, grid, grid, lambda s, t: np.stack([s, t], axis=-1) / 2 + 0.5)
+
+
+def flipped(mesh: Mesh) -> Mesh:
+    """The same surface seen from its other side."""
+    return mesh._replace(normals=-mesh.normals, triangles=mesh.triangles[:, ::-1])
+
+
+MESHES = {
+    "curved_patch.ply": curved_patch,
+    "kettle_body.ply": kettle_body,
+    "kettle_lid.ply": kettle_lid,
+    "kettle_knob.ply": kettle_knob,
+    "kettle_spout.ply": kettle_spout,
+    "kettle_handle.ply": kettle_handle,
+    "cove.ply": cove,
+    "plate.ply": plate,
+}
+
+
+# --------------------------------------------------------------------------------------------------
+# Images
+# --------------------------------------------------------------------------------------------------
+
+
+def studio(height: int = 128) -> np.ndarray:
+    """A dim studio with softboxes: (height, 2·height, 3) radiance, laid out as for ``envmap``.
+
+    Each softbox is a rectangle in the plane that faces it, with soft edges.
+    """
+    angle = np.pi * (np.arange(2 * height) + 0.5) / height
+    azimuth, polar = np.meshgrid(angle, angle[:height])
+    direction = np.stack([np.sin(azimuth) * np.sin(polar), np.cos(polar),
+                          -np.cos(azimuth) * np.sin(polar)], axis=-1)
+
+    # Walls: darkest towards the floor, a little cooler above.
+    up = 0.5 + 0.5 * direction[..., 1:2]
+    radiance = 0.015 + up**2 * np.array([0.035, 0.04, 0.05])
+
+    # Azimuth and elevation in degrees; half width, half height, soft edge as tangents; radiance.
+    softboxes = [(80, 65, 0.42, 0.28, 0.12, (1.20, 1.12, 1.00)),
+                 (-60, 28, 0.18, 0.80, 0.10, (0.60, 0.80, 1.10)),
+                 (175, 30, 0.50, 0.20, 0.10, (0.90, 0.62, 0.40)),
+                 (262, 14, 1.10, 0.08, 0.08, (0.25, 0.33, 0.45))]
+    for degrees, elevation, width, tall, edge, colour in softboxes:
+        a, e = np.radians(degrees), np.radians(elevation)
+        facing = np.array([np.sin(a) * np.cos(e), np.sin(e), -np.cos(a) * np.cos(e)])
+        right = np.array([np.cos(a), 0.0, np.sin(a)])
+        depth = direction @ facing
+        x = direction @ right / np.maximum(depth, 1e-3)
+        y = direction @ np.cross(facing, right) / np.maximum(depth, 1e-3)
+        shape = smooth_step((width - np.abs(x)) / edge) * smooth_step((tall - np.abs(y)) / edge)
+        radiance += (shape * (depth > 0))[..., None] * np.array(colour)
+    return radiance
+
+
+def smooth_step(x: np.ndarray) -> np.ndarray:
+    """0 below −1, 1 above 1, a cubic between."""
+    x = np.clip(0.5 + 0.5 * x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def write_exr(filename: Path, channels: dict[str, np.ndarray]) -> None:
+    """Write half-float ``channels``; an (H, W, 3) array under "RGB" is three of them."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    halves = {name: np.ascontiguousarray(pixels, np.float16) for name, pixels in channels.items()}
+    OpenEXR.File(header, halves).write(str(filename))
+
+
+NORMAL_MAPS = {
+    "isotropic.exr": lambda: maps.isotropic(MAP_SIZE, seed=1),
+    "scratched.exr": lambda: maps.scratched(MAP_SIZE, seed=2),
+    "brushed.exr": lambda: maps.brushed(MAP_SIZE, seed=3),
+}
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def main(folder: Path) -> None:
+    """Write all assets below ``folder``."""
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    (folder / "maps").mkdir(exist_ok=True)
+    for name, make in MESHES.items():
+        write_ply(folder / "meshes" / name, make())
+    write_exr(folder / "studio.exr", {"RGB": studio()})
+    for name, make in NORMAL_MAPS.items():
+        normals = make().normals
+        write_exr(folder / "maps" / name, {"R": normals[..., 0], "G": normals[..., 1]})
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)
