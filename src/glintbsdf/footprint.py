@@ -111,9 +111,9 @@ def is_literal_zero(value: float | mi.Float) -> bool:
     return value.state == dr.VarState.Literal and not dr.grad_enabled(value) and value[0] == 0
 
 
-def finite_or_zero(v: mi.Vector2f) -> mi.Vector2f:
+def finite_or_zero(v: mi.Vector2f | mi.Vector3f) -> mi.Vector2f | mi.Vector3f:
     """``v``, or the zero vector in lanes where a component is infinite or NaN."""
-    return dr.select(dr.all(dr.isfinite(v)), v, mi.Vector2f(0))
+    return dr.select(dr.all(dr.isfinite(v)), v, type(v)(0))
 
 
 def cone_partials(
@@ -129,13 +129,18 @@ def cone_partials(
     Returns two ``mi.Vector2f``; at exactly grazing incidence they are not finite.
     """
     omega = si.to_world(si.wi)
-    x, y = mi.coordinate_system(omega)
-    inv_cosine = dr.rcp(dr.dot(si.n, omega))
-    along_omega = omega * inv_cosine
     return tuple(
-        tangent_to_uv(si.dp_du, si.dp_dv, width * (axis - along_omega * dr.dot(si.n, axis)))
-        for axis in (x, y)
+        tangent_to_uv(si.dp_du, si.dp_dv, width * project_along(omega, si.n, axis))
+        for axis in mi.coordinate_system(omega)
     )
+
+
+def project_along(d: mi.Vector3f, n: mi.Vector3f, v: mi.Vector3f) -> mi.Vector3f:
+    """``v`` moved along direction ``d`` into the plane through the origin with normal ``n``.
+
+    The sign of ``d`` plays no part. Not finite where ``d`` lies in the plane.
+    """
+    return v - d * (dr.dot(n, v) / dr.dot(n, d))
 
 
 def tangent_to_uv(dp_du: mi.Vector3f, dp_dv: mi.Vector3f, offset: mi.Vector3f) -> mi.Vector2f:

@@ -1,0 +1,239 @@
+r"""
+.. _integrator-glint_path:
+
+Path tracer with footprints (:monosp:`glint_path`)
+--------------------------------------------------
+
+.. pluginparameters::
+
+ * - max_depth
+   - |int|
+   - Longest path depth (where -1 corresponds to :math:`\infty`). A value of 1 renders directly
+     visible light sources only, 2 adds single-bounce (direct) illumination, and so on.
+     (Default: -1)
+
+ * - rr_depth
+   - |int|
+   - Path depth from which on paths may be ended by *russian roulette*. (Default: 5)
+
+ * - hide_emitters
+   - |bool|
+   - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+This is Mitsuba's :ref:`path <integrator-path>` (BSDF and emitter sampling, combined by multiple
+importance sampling), with one addition: the surface interaction that it hands to a BSDF carries
+the UV partials ``duv_dx`` and ``duv_dy`` of the pixel, at *every* hit. Glint BSDFs average their
+normals over this footprint. The stock integrators leave the partials at zero in Mitsuba's JIT
+variants, and a glint BSDF then has to fall back to the cone of its ``pixel_spread`` parameter,
+which knows the distance to the last hit only.
+
+At the first hit the partials come from the sensor's ray differentials (scaled by
+:math:`1/\sqrt{\mathrm{spp}}`, as everywhere in Mitsuba). Beyond it they come from a ray cone with
+an elliptical cross-section: it grows with distance, changes at each bounce by the curvature of the
+surface and the index of refraction :cite:`Igehy1999`, and is widened by the lobe that the next
+direction was sampled from. A direction of density :math:`p` stands for the solid angle
+:math:`1/(p\,\mathrm{spp})` :cite:`Suykens2001`; smooth mirrors and glass widen nothing. What a
+mirror shows is thus filtered as sharply as its image, and what a rough surface shows is filtered
+as broadly as its lobe :cite:`AkenineMoller2021`. Sensors without ray differentials start with a
+cone of no width.
+
+For scenes without glint BSDFs (or other BSDFs that read UV partials) the image is that of
+``path``, sample by sample. Participating media are not handled, and only JIT variants are
+supported. The partials are treated as constants when the rendering is differentiated.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: glint-path-integrator
+
+        <integrator type="glint_path">
+            <integer name="max_depth" value="8"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'glint_path',
+        'max_depth': 8
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.errors import check
+from glintbsdf.raycone import RayCone, lobe_width
+
+
+class GlintPathIntegrator(mi.SamplingIntegrator):
+    """``path`` with a footprint at every hit; documentation in the module's docstring."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)  # reads hide_emitters
+        max_depth = props.get("max_depth", -1)
+        rr_depth = props.get("rr_depth", 5)
+        owner = props.plugin_name()
+        check(max_depth >= -1, owner, "max_depth", "-1 (infinite) or a value >= 0", max_depth)
+        check(rr_depth > 0, owner, "rr_depth", "greater than zero", rr_depth)
+        self.max_depth = max_depth if max_depth >= 0 else 0xFFFFFFFF
+        self.rr_depth = rr_depth
+
+    @dr.syntax
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray_: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+        """Radiance along the sensor's rays, whether it belongs to a surface, and no AOVs."""
+        if dr.hint(self.max_depth == 0, mode="scalar"):
+            return mi.Spectrum(0), mi.Bool(False), []
+
+        # --------------------- Configure loop state ----------------------
+
+        ray = mi.Ray3f(ray_)                   # Current ray
+        cone = RayCone.from_ray(ray_)          # Its width, for footprints
+        active = mi.Bool(active)               # Active SIMD lanes
+        L = mi.Spectrum(0)                     # Radiance accumulator
+        β = mi.Spectrum(1)                     # Path throughput weight
+        η = mi.Float(1)                        # Index of refraction
+        depth = mi.UInt32(0)                   # Depth of current vertex
+        bsdf_ctx = mi.BSDFContext()
+
+        # Variables caching information from the previous bounce
+        si_prev = dr.zeros(mi.Interaction3f)
+        bsdf_pdf_prev = mi.Float(1)
+        bsdf_delta_prev = mi.Bool(True)
+
+        # An environment is visible by itself, everything else once a path has met it
+        valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
+
+        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+
+        # ---------------------- Hide area emitters ----------------------
+
+        if dr.hint(self.hide_emitters, mode="scalar"):
+            # Continue rays that hit area emitters until they meet something else
+            skip = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (per lane)
+            si_skip = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
+            pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
+
+        while dr.hint(active, max_iterations=self.max_depth, label="glint_path"):
+            # The curvature of the surface is what bends ray cones
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
+
+            # ---------------------- Direct emission ----------------------
+
+            # Weigh the emitter against the chance that emitter sampling would have found it
+            ds = mi.DirectionSample3f(scene, si, si_prev)
+            em_pdf = scene.pdf_emitter_direction(si_prev, ds, ~bsdf_delta_prev)
+            mis = mis_weight(bsdf_pdf_prev, em_pdf)
+            L = spectrum_fma(β, ds.emitter.eval(si, bsdf_pdf_prev > 0) * mis, L)
+
+            # Continue tracing the path at this point?
+            active_next = (depth + 1 < self.max_depth) & si.is_valid()
+            bsdf = si.bsdf()
+
+            # ------------------------- Footprint -------------------------
+
+            # The sensor's offset rays are intersected with the tangent plane (exact differences);
+            # later hits have no offset rays, their partials come from the cone (first order).
+            cone = cone.at(si, ray.d)
+            duv_dx, duv_dy = cone.uv_partials(si)
+            si.compute_uv_partials(ray_)
+            si.duv_dx = dr.select(depth == 0, si.duv_dx, duv_dx)
+            si.duv_dy = dr.select(depth == 0, si.duv_dy, duv_dy)
+
+            # ---------------------- Emitter sampling ----------------------
+
+            active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
+            active_em &= ds.pdf != 0
+
+            # Recompute the contribution with AD to enable light source optimization
+            if dr.hint(dr.grad_enabled(si.p), mode="scalar"):
+                ds.d = dr.normalize(ds.p - si.p)
+                em_value = scene.eval_emitter_direction(si, ds, active_em)
+                em_weight = dr.select(ds.pdf != 0, em_value / ds.pdf, 0)
+
+            wo = si.to_local(ds.d)
+
+            # ------ Evaluate BSDF * cos(theta) and sample a direction ------
+
+            bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
+                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d()
+            )
+            bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
+            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
+            L[active_em] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
+
+            # ---------------------- BSDF sampling ----------------------
+
+            bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
+            ray_next = si.spawn_ray(si.to_world(bs.wo))
+
+            # Samples must not move with the parameters that the image is differentiated by: keep
+            # the direction, and let derivatives reach the BSDF's value only.
+            if dr.hint(dr.grad_enabled(ray_next), mode="scalar"):
+                ray_next = dr.detach(ray_next)
+                value, pdf = bsdf.eval_pdf(bsdf_ctx, si, si.to_local(ray_next.d), active)
+                bsdf_weight[pdf > 0] = value / dr.detach(pdf)
+
+            # ------ Update loop variables based on current interaction ------
+
+            β = β * bsdf_weight
+            η *= bs.eta
+            valid |= (
+                active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            )
+
+            discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | mi.has_flag(
+                bs.sampled_type, mi.BSDFFlags.Null
+            )
+            spread = dr.select(discrete, 0, lobe_width(bs.pdf, sampler.sample_count()))
+            cone = cone.scattered(si, ray.d, ray_next.d, bs.eta, spread)
+            ray = ray_next
+
+            # Information about the current vertex needed by the next iteration
+            si_prev = mi.Interaction3f(si)
+            bsdf_pdf_prev = bs.pdf
+            bsdf_delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+
+            # -------------------- Stopping criterion ---------------------
+
+            depth[si.is_valid()] += 1
+
+            # Russian roulette keeps path weights near one; η² undoes the solid-angle compression
+            # at refractive boundaries. Its weight is detached, as the paths' number is fixed.
+            β_max = dr.max(mi.unpolarized_spectrum(β))
+            rr_prob = dr.detach(dr.minimum(β_max * dr.square(η), 0.95))
+            rr_active = depth >= self.rr_depth
+            rr_continue = sampler.next_1d() < rr_prob
+            β[rr_active] *= dr.rcp(rr_prob)
+
+            active = active_next & (~rr_active | rr_continue) & (β_max != 0)
+            pi = scene.ray_intersect_preliminary(ray, coherent=False, reorder=True, active=active)
+
+        return dr.select(valid, L, 0), valid, []
+
+    def to_string(self) -> str:
+        return (
+            f"GlintPathIntegrator[\n  max_depth = {self.max_depth},\n"
+            f"  rr_depth = {self.rr_depth}\n]"
+        )
+
+
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
+    """Power heuristic (Veach 1997, section 9.2.2) for a sample of ``pdf_a``; 0 if undefined."""
+    pdf_a, pdf_b = dr.square(pdf_a), dr.square(pdf_b)
+    weight = pdf_a / (pdf_a + pdf_b)
+    return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
+
+
+def spectrum_fma(a: mi.Spectrum, b: mi.Spectrum, c: mi.Spectrum) -> mi.Spectrum:
+    """``a b + c``: in one rounding, or with the Mueller matrices' product in polarised variants."""
+    return a * b + c if mi.is_polarized else dr.fma(a, b, c)
+
+
+mi.register_integrator("glint_path", lambda props: GlintPathIntegrator(props))
