@@ -1,0 +1,183 @@
+r"""
+.. _bsdf-glint_manifold:
+
+Glints of a normal map, exact (:monosp:`glint_manifold`)
+--------------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Image file of the normal or height map: OpenEXR, PNG, TIFF and what else Mitsuba reads. A
+     relative name counts from the scene's folder.
+
+ * - bitmap
+   - :monosp:`mitsuba.Bitmap`
+   - The map itself, instead of :monosp:`filename`, when the scene is built in Python.
+
+ * - data
+   - |tensor|
+   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
+     the map in use: the projected normals, H×W×2.
+   - |exposed|, |differentiable|
+
+ * - map_type
+   - |string|
+   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z) in [−1, 1]; :monosp:`height`, which
+     gives normals ∝ (−∂h/∂x, −∂h/∂y, 1); or :monosp:`auto`, a height where there is one channel or
+     all channels are equal. Files of unsigned integers are decoded from [0, 1].
+     (Default: :monosp:`auto`)
+
+ * - height_scale
+   - |float|
+   - Texels per unit of height. (Default: 1)
+
+ * - wrap_mode
+   - |string|
+   - What lies beyond the map's border: :monosp:`repeat`, :monosp:`mirror` or :monosp:`clamp`.
+     (Default: :monosp:`repeat`)
+
+ * - to_uv
+   - |transform|
+   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
+   - |exposed|
+
+ * - kernel
+   - |string|
+   - Weight of the map's points under the footprint with standard deviation σ: :monosp:`gaussian`,
+     cut at 3σ; :monosp:`disk`, uniform within 1.5σ; :monosp:`box`, uniform within ±1.5σ along u and
+     v. (Default: :monosp:`gaussian`)
+
+ * - epsilon
+   - |float|
+   - Smallest Jacobian determinant of a triangle of the manifold, in (0, 1): a flat part of the map
+     becomes a highlight of this area on the disk of projected normals. (Default: 1e-6)
+
+ * - threshold
+   - |float|
+   - The threshold τ of the paper's hierarchy. Only 0, exact evaluation, is supported so far.
+     (Default: 0)
+
+ * - max_error
+   - |float|
+   - Relative L1 error of the P-NDF allowed. Only 0, exact evaluation, is supported so far.
+     (Default: 0)
+
+ * - masking
+   - |string|
+   - Masking and shadowing: :monosp:`beckmann`, that of a Beckmann surface as rough as the map,
+     or :monosp:`none`. (Default: :monosp:`beckmann`)
+
+ * - height_correlated
+   - |bool|
+   - Whether masking and shadowing are correlated by height, rather than independent.
+     (Default: |true|)
+
+ * - footprint_sigma
+   - |float|
+   - Standard deviation of the footprint, in pixels. (Default: 0.5)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - pixel_spread
+   - |float|
+   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
+     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
+     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - material
+   - |string|
+   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
+
+ * - eta, k
+   - |spectrum| or |texture|
+   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
+     (Default: 0 and 1 where only the other is given)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - int_ior, ext_ior
+   - |float| or |string|
+   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
+     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
+     :monosp:`bk7` and :monosp:`air` where only the other is given)
+
+ * - specular_reflectance
+   - |spectrum| or |texture|
+   - Factor on the reflection, in [0, 1]. (Default: 1)
+   - |exposed|, |differentiable|
+
+The glints of a surface whose normals come from a high-resolution map. Every pixel sees a patch of
+the map, its *footprint*; the distribution of the normals in it, the P-NDF, takes the place of the
+smooth normal distribution of a microfacet BRDF. As in :cite:`Wu24Glint`, the map is a mesh of
+triangles in position × normal space, on which the P-NDF has a closed form, evaluated exactly:
+
+.. math::
+
+    D(m) = \sum_{\Delta:\, m \in n(\Delta)} \frac{k(u^* - x)}{|\det J_\Delta|}
+
+where :math:`u^*` is the place in triangle :math:`\Delta` whose normal is :math:`m`, :math:`k` the
+kernel around the footprint's centre :math:`x`, and :math:`J_\Delta` the Jacobian of the normals
+over the triangle. Sampling draws from exactly this density.
+
+The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
+inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
+coordinates.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: lst-glint_manifold
+
+        <bsdf type="glint_manifold">
+            <string name="filename" value="scratches.exr"/>
+            <transform name="to_uv">
+                <scale x="4" y="4"/>
+            </transform>
+            <string name="material" value="Al"/>
+        </bsdf>
+
+    .. code-tab:: python
+
+        'type': 'glint_manifold',
+        'filename': 'scratches.exr',
+        'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
+        'material': 'Al'
+
+Reference: Liwen Wu, Fujun Luan, Miloš Hašan and Ravi Ramamoorthi, "Position-Normal Manifold for
+Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), section 4.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from glintbsdf.bsdf import GlintBSDF
+from glintbsdf.errors import check
+from glintbsdf.kernels import KERNELS
+from glintbsdf.microfacet import BeckmannMasking
+from glintbsdf.parameters import Parameters
+from glintbsdf.pndf import Manifold
+
+
+class GlintManifold(GlintBSDF):
+    """The plugin ``glint_manifold``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        parameters = Parameters(props)
+        for name in ("threshold", "max_error"):
+            value = parameters.number(name, 0.0)
+            check(value == 0, self.owner, name, "0 (exact), as more is not yet supported", value)
+        self.pndf = Manifold(
+            parameters.normal_map(),
+            kernel=parameters.choice("kernel", "gaussian", KERNELS),
+            epsilon=parameters.number("epsilon", 1e-6),
+            owner=self.owner,
+        )
+        masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
+        height_correlated = parameters.boolean("height_correlated", True)
+        self.masking = None
+        if masking == "beckmann":
+            self.masking = BeckmannMasking(self.pndf, height_correlated)
+
+
+mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))

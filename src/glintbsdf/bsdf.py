@@ -1,0 +1,190 @@
+"""The base class of every glint BSDF: a microfacet BRDF around a P-NDF.
+
+``mi.BSDF`` is another class in every variant of Mitsuba, so this module is imported anew for each
+(see ``registration.py``).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import microfacet
+from .errors import check
+from .footprint import Footprint, is_literal_zero
+from .parameters import Parameters
+
+
+class GlintBSDF(mi.BSDF):
+    """A one-sided glossy BRDF, ``F D G / (4 cosθ_i cosθ_o)``, with D the P-NDF of a footprint.
+
+    The base class reads the parameters that all glint BSDFs share and implements Mitsuba's
+    interface once. A subclass's constructor calls this one, reads its own parameters, and sets
+
+    Attributes:
+        pndf: the P-NDF: ``eval(m, footprint, active)``, the density D over the disk of projected
+            normals, and ``sample(footprint, sample1, sample2, active)``, which draws from exactly
+            that density; ``traverse`` and ``parameters_changed``.
+        masking: :class:`~glintbsdf.microfacet.SmithMasking`, or None for none.
+
+    Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.owner, self.name = props.plugin_name(), props.id()
+        parameters = Parameters(props)
+        self.to_uv = parameters.to_uv()
+        self.footprint_sigma = mi.Float(parameters.number("footprint_sigma", 0.5))
+        self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
+        self.fresnel = parameters.fresnel()
+        self.specular_reflectance = parameters.specular_reflectance()
+        self.warned_of_point_footprint = False
+
+        self.m_flags = (mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
+                        | mi.BSDFFlags.SpatiallyVarying | mi.BSDFFlags.Anisotropic)
+        self.m_components = [self.m_flags]
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        smooth, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.Discontinuous
+        self.pndf.traverse(callback)
+        callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
+        callback.put("footprint_sigma", self.footprint_sigma, smooth | discontinuous)
+        callback.put("pixel_spread", self.pixel_spread, smooth | discontinuous)
+        if self.fresnel is not None:
+            self.fresnel.traverse(callback)
+        if self.specular_reflectance is not None:
+            callback.put("specular_reflectance", self.specular_reflectance, smooth)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        for key in {"footprint_sigma", "pixel_spread"} & set(keys):
+            value = getattr(self, key)
+            check(dr.all(dr.isfinite(value) & (value >= 0)),
+                  self.owner, key, "a finite number ≥ 0", value)
+        self.pndf.parameters_changed(keys)
+        if self.masking is not None:
+            self.masking.parameters_changed()
+
+    def sample(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float,
+               sample2: mi.Point2f, active: mi.Bool = True) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        bs = dr.zeros(mi.BSDFSample3f)
+        cos_theta_i = mi.Frame3f.cos_theta(si.wi)
+        active = mi.Bool(active) & (cos_theta_i > 0)
+        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
+            return bs, mi.Spectrum(0)
+
+        # Draw a projected normal and reflect about it. One that lies outside the disk, or reflects
+        # below the horizon, is an invalid sample: its mass is missing from the pdf as well.
+        footprint = self.footprint(si)
+        s = self.pndf.sample(footprint, sample1, sample2, active)
+        m = microfacet.normal_from_projection(s)
+        wo = mi.reflect(si.wi, mi.Normal3f(m))
+        active &= (m.z > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+        density = self.pndf.eval(s, footprint, active)
+        active &= density > 0
+
+        bs.wo = wo
+        bs.pdf = dr.select(active, microfacet.reflected_pdf(density, wo, m), 0)
+        bs.eta = 1
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+        bs.sampled_component = 0
+
+        # D drops out of eval/pdf.
+        weight = dr.dot(wo, m) / dr.select(active, cos_theta_i * m.z, 1)
+        return bs, self.reflected(weight, ctx, si, si.wi, wo, m, footprint, active)
+
+    def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
+             active: mi.Bool = True) -> mi.Spectrum:
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
+            active: mi.Bool = True) -> mi.Float:
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+    def eval_pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
+                 active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Float]:
+        # One P-NDF query serves both. What a caller does not use, Dr.Jit leaves out of the kernel.
+        cos_theta_i = mi.Frame3f.cos_theta(si.wi)
+        active = mi.Bool(active) & (cos_theta_i > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
+            return mi.Spectrum(0), mi.Float(0)
+
+        # Lanes below the horizon compute a harmless reflection along the normal: a NaN in a lane
+        # that is masked away would still reach its derivatives.
+        up = mi.Vector3f(0, 0, 1)
+        wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
+        m = microfacet.half_vector(wi, wo)
+        footprint = self.footprint(si)
+        density = self.pndf.eval(mi.Vector2f(m.x, m.y), footprint, active)
+        value = microfacet.reflected_value(density, wi.z)
+        return (self.reflected(value, ctx, si, wi, wo, m, footprint, active),
+                dr.select(active, microfacet.reflected_pdf(density, wo, m), 0))
+
+    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f,
+                                 active: mi.Bool = True) -> mi.Spectrum:
+        """The albedo for denoisers: tint and Fresnel reflectance of the macroscopic surface.
+
+        Mitsuba's default, ``π`` times a value of the BRDF, would be the very glints that an albedo
+        image must be free of.
+        """
+        cos_theta_i = mi.Frame3f.cos_theta(si.wi)
+        active = mi.Bool(active) & (cos_theta_i > 0)
+        albedo = self.tint(si, active)
+        if self.fresnel is not None:
+            cos_theta_i = dr.select(active, cos_theta_i, 1)
+            albedo = albedo * self.fresnel.reflectance(cos_theta_i, si, active)
+        albedo = dr.select(active, albedo, 0)
+        return mi.mueller.depolarizer(albedo) if mi.is_polarized else albedo
+
+    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
+        """The footprint at ``si`` in the UV space of the map."""
+        footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
+        if footprint.is_known_to_be_zero() and not is_literal_zero(self.footprint_sigma):
+            self.warn_of_point_footprint()
+        return footprint if self.to_uv == type(self.to_uv)() else footprint.transformed(self.to_uv)
+
+    def warn_of_point_footprint(self) -> None:
+        """Say, once, that nothing tells how large a pixel is."""
+        if not self.warned_of_point_footprint:
+            self.warned_of_point_footprint = True
+            mi.Log(mi.LogLevel.Warn,
+                   f'{self.owner} "{self.name}": the integrator gives no footprint and '
+                   '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
+                   'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
+                   'set "pixel_spread" to the angle of a pixel in radians.')
+
+    def tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """``specular_reflectance`` at ``si``."""
+        if self.specular_reflectance is None:
+            return mi.UnpolarizedSpectrum(1)
+        return self.specular_reflectance.eval(si, active)
+
+    def reflected(self, value: mi.Float, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f,
+                  wi: mi.Vector3f, wo: mi.Vector3f, m: mi.Vector3f, footprint: Footprint,
+                  active: mi.Bool) -> mi.Spectrum:
+        """``value`` times masking, tint and Fresnel reflectance or Mueller matrix, where active."""
+        if self.masking is not None:
+            value = value * self.masking.eval(wi, wo, footprint, active)
+        tint = self.tint(si, active)
+        if mi.is_polarized:
+            spectrum = value * microfacet.mueller_reflection(
+                self.fresnel.index(si, active), tint, ctx.mode, wi, wo, m)
+        else:
+            spectrum = value * tint
+            if self.fresnel is not None:
+                spectrum = spectrum * self.fresnel.reflectance(dr.dot(wo, m), si, active)
+        return dr.select(active, spectrum, 0)
+
+    def to_string(self) -> str:
+        members = {
+            "pndf": self.pndf,
+            "masking": self.masking,
+            "fresnel": self.fresnel,
+            "specular_reflectance": self.specular_reflectance,
+            "to_uv": None if self.to_uv == type(self.to_uv)() else self.to_uv,
+            "footprint_sigma": self.footprint_sigma[0],
+            "pixel_spread": self.pixel_spread[0],
+        }
+        lines = [f"  {name} = {value}".replace("\n", "\n  ")
+                 for name, value in members.items() if value is not None]
+        return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
