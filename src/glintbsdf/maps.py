@@ -165,7 +165,7 @@ def _grooves(shape: tuple[int, int], count: int, length: float, width: float, sl
     middle = rng.uniform(0, shape[0] * shape[1], (2, count, 1, 1))
 
     along = np.arange(-np.ceil(half_length), np.ceil(half_length) + 1)[:, None]
-    reach = np.ceil(half_width * np.sqrt(2)) + 1  # a scratch leans by up to 45 degrees, a bit more bent
+    reach = np.ceil(half_width * np.sqrt(2)) + 1  # it leans by 45 degrees at most
     beside = np.arange(-reach, reach + 1)
     arc = along * np.sqrt(1 + tangent**2)
     centre = middle[1] + along * tangent + arc**2 * curvature / 2

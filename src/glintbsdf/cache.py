@@ -1,0 +1,114 @@
+"""A cache on disk for what is built from a map: dictionaries of plain NumPy arrays.
+
+The environment variable ``GLINTBSDF_CACHE`` names its directory; ``off`` or an empty value disables
+it. By default it is the user's cache directory (on Linux ``~/.cache/glintbsdf``). The directory may
+be deleted at any time. The least recently used files go when the total passes 4 GiB.
+
+Files appear whole or not at all, so processes may share the directory. A file that is cut short or
+damaged is noticed by the checksum of its arrays and replaced. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+LIMIT = 4 << 30  # bytes
+_STALE = 3600  # seconds after which an unfinished file can only be what a killed process left
+
+
+def directory() -> Path | None:
+    """The directory in use, which need not exist yet, or None where the cache is off."""
+    value = os.environ.get("GLINTBSDF_CACHE")
+    if value is None:
+        import platformdirs
+
+        return platformdirs.user_cache_path("glintbsdf", appauthor=False)
+    return None if value in ("", "off") else Path(value).expanduser()
+
+
+def load_or_build(key: str, build: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays stored under ``key``, or call ``build`` and store what it returns.
+
+    ``key`` must hold all that decides the result: what is built, the version of its format, the
+    map's content hash and every parameter. A cache that cannot be read or written costs one warning
+    and no more; an error in ``build`` is passed on.
+    """
+    folder = directory()
+    if folder is None:
+        return dict(build())
+    path = folder / f"{hashlib.blake2b(key.encode(), digest_size=20).hexdigest()}.npz"
+    arrays = _load(path)
+    if arrays is None:
+        arrays = dict(build())
+        _store(path, arrays)
+    return arrays
+
+
+def _load(path: Path) -> dict[str, np.ndarray] | None:
+    """Read a file whole, or return None where there is none or it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except Exception:  # whatever is the matter with the file, it is built again
+        return None
+    with contextlib.suppress(OSError):  # a cache that may only be read serves as well
+        os.utime(path)  # used just now
+    return arrays
+
+
+def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a file beside its place, then move it there at once.
+
+    Without fsync: should the power fail, the checksums reveal what the disk has lost.
+    """
+    if any(array.dtype.hasobject for array in arrays.values()):
+        raise TypeError("only plain arrays can be cached, not arrays of Python objects")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            try:
+                np.savez(file, **arrays)
+                file.close()
+                os.replace(file.name, path)
+            except BaseException:
+                file.close()
+                os.unlink(file.name)
+                raise
+        _tidy(path.parent)
+    except OSError as error:
+        _warn_once(str(path.parent), str(error))
+
+
+def _tidy(folder: Path) -> None:
+    """Delete what killed processes left, then the least recently used files beyond the limit.
+
+    Another process may do the same at the same time, or still read a file (which Windows keeps).
+    """
+    now, total = time.time(), 0
+    with contextlib.suppress(OSError):
+        for entry in folder.glob("*.tmp"):
+            if now - entry.stat().st_mtime > _STALE:
+                entry.unlink()
+        used = sorted(((entry.stat(), entry) for entry in folder.glob("*.npz")),
+                      key=lambda pair: pair[0].st_mtime, reverse=True)
+        for position, (status, entry) in enumerate(used):
+            total += status.st_size
+            if total > LIMIT and position > 0:
+                entry.unlink()
+
+
+@functools.cache
+def _warn_once(folder: str, error: str) -> None:
+    warnings.warn(f"glintbsdf builds without its cache, because {folder} cannot be written "
+                  f"({error}). Name another directory in GLINTBSDF_CACHE, or set it to off.",
+                  stacklevel=4)
