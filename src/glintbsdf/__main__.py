@@ -1,0 +1,5 @@
+"""``python -m glintbsdf``: the command line."""
+
+from .cli import main
+
+main()

@@ -1,0 +1,240 @@
+"""The command line: ``glintbsdf render``, ``pndf`` and ``doctor``.
+
+Only what concerns the terminal is here; the work is done in other modules.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+import click
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+from . import __version__, llvm, pndf_plot, rendering
+from .doctor import examine
+
+Definitions = tuple[str, ...]
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+
+def main() -> NoReturn:
+    """Run the command line. Errors are one line on stderr; ``--debug`` shows where they come from.
+
+    Exit status: 0 done, 1 failed, 2 wrong usage.
+    """
+    debug = "--debug" in sys.argv[1:]
+    try:
+        status = commands.main(prog_name="glintbsdf", standalone_mode=False)
+        sys.exit(status if isinstance(status, int) else 0)
+    except click.Abort:
+        sys.exit("Aborted.")
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except Exception as error:
+        if debug:
+            raise
+        sys.exit(f"Error: {one_line(str(error)) or type(error).__name__}")
+
+
+def one_line(message: str) -> str:
+    """Return an error message without the Python traceback and the place in Mitsuba's sources.
+
+    Mitsuba wraps the error of a Python plugin in its own message, traceback included.
+    """
+    message = re.sub(r"^\[\w+\.cpp:\d+\] ", "", message)
+    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+(?:[\w.]+: )?", "", message)
+    return " ".join(message.split())
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="glintbsdf")
+@click.option("--debug", is_flag=True, help="Show the Python traceback of an error.")
+def commands(debug: bool) -> None:
+    """Glint BSDFs for Mitsuba 3."""
+
+
+# ---------------------------------------------------------------------------------------------
+#  Options that commands share
+# ---------------------------------------------------------------------------------------------
+
+
+def _activate(variant: str) -> None:
+    """Choose a Mitsuba variant; what prevents it is told before Dr.Jit can abort the process."""
+    known = [name for name in mi.variants() if not name.startswith("scalar")]
+    if variant not in known:
+        raise click.BadParameter(
+            f'must be one of {", ".join(known)} (got "{variant}")', param_hint="-m"
+        )
+    if variant.startswith("llvm"):
+        llvm.require_usable()
+    elif not dr.has_backend(dr.JitBackend.CUDA):
+        raise click.ClickException(
+            f"{variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none. "
+            f"On the CPU: -m {DEFAULT_VARIANT}"
+        )
+    mi.set_variant(variant)
+
+
+def _parse_definitions(
+    _context: click.Context, _parameter: click.Parameter, values: Definitions
+) -> dict[str, str]:
+    """Turn ``("a=1", "b=2")`` into a dictionary of strings."""
+    pairs = [value.partition("=") for value in values]
+    for value, (key, equals, _) in zip(values, pairs, strict=True):
+        if not key or not equals:
+            raise click.BadParameter(f'must be key=value (got "{value}")')
+    return {key: value for key, _, value in pairs}
+
+
+def _parse_output(
+    _context: click.Context, _parameter: click.Parameter, path: Path | None
+) -> Path | None:
+    """Accept only names of image files that can be written."""
+    if path is not None and path.suffix.lower() not in rendering.FORMATS:
+        allowed = " or ".join(rendering.FORMATS)
+        raise click.BadParameter(f'must end in {allowed} (got "{path}")')
+    return path
+
+
+_variant_option = click.option(
+    "-m",
+    "variant",
+    metavar="VARIANT",
+    default=DEFAULT_VARIANT,
+    show_default=True,
+    help="Variant of Mitsuba.",
+)
+_file = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+def _define_option(meaning: str):
+    return click.option(
+        "-D",
+        "definitions",
+        metavar="KEY=VALUE",
+        multiple=True,
+        callback=_parse_definitions,
+        help=meaning,
+    )
+
+
+# ---------------------------------------------------------------------------------------------
+#  Commands
+# ---------------------------------------------------------------------------------------------
+
+
+@commands.command()
+@click.argument("scene", type=_file)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_output,
+    help="Image to write, .exr or .png.  [default: SCENE.exr]",
+)
+@_variant_option
+@click.option(
+    "--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]"
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@_define_option("Parameter of the scene; may be repeated.")
+def render(
+    scene: Path,
+    output: Path | None,
+    variant: str,
+    spp: int | None,
+    seed: int,
+    definitions: dict[str, str],
+) -> None:
+    """Render the Mitsuba scene SCENE to an image.
+
+    The footprint of glint BSDFs that leave "pixel_spread" at 0 is that of the camera's pixels.
+    """
+    _activate(variant)
+    path = output or scene.with_suffix(".exr")
+    columns = ("{task.description}", BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with (
+        rendering.replacing(path) as unfinished,
+        Progress(*columns, console=Console(stderr=True)) as bar,
+    ):
+        task = bar.add_task("Loading", total=None)
+        loaded = rendering.load_scene(scene, definitions)
+
+        def report(done: int, total: int) -> None:
+            bar.update(task, description="Rendering", completed=done, total=total)
+
+        rendering.save(rendering.render(loaded, spp, seed, report), unfinished)
+    click.echo(path)
+
+
+@commands.command()
+@click.option("--type", "plugin", required=True, metavar="TYPE", help="Type of the glint BSDF.")
+@click.option("--map", "map_file", type=_file, required=True, help="Normal or height map.")
+@click.option("--uv", type=(float, float), required=True, help="Centre of the footprint.")
+@click.option(
+    "--sigma",
+    type=click.FloatRange(min=0),
+    required=True,
+    metavar="TEXELS",
+    help="Standard deviation of the footprint in texels.",
+)
+@click.option(
+    "--res",
+    type=click.IntRange(2, 4096),
+    default=256,
+    show_default=True,
+    help="Pixels of a drawing along each axis.",
+)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_output,
+    default="pndf.png",
+    show_default=True,
+    help="Drawing to write.",
+)
+@_variant_option
+@_define_option("Parameter of the BSDF; may be repeated.")
+def pndf(
+    plugin: str,
+    map_file: Path,
+    uv: tuple[float, float],
+    sigma: float,
+    res: int,
+    output: Path,
+    variant: str,
+    definitions: dict[str, str],
+) -> None:
+    """Draw a P-NDF beside its reference.
+
+    Left the plugin's density over the disk of normals, right the same by counting samples; printed
+    are the relative L1 difference, the part of it that is the noise of the reference, and the time.
+    """
+    _activate(variant)
+    with rendering.replacing(output) as unfinished:
+        comparison = pndf_plot.compare(plugin, map_file, uv, sigma, res, definitions)
+        rendering.save(comparison.drawing(), unfinished)
+    click.echo(comparison)
+    click.echo(output)
+
+
+@commands.command()
+@click.pass_context
+def doctor(context: click.Context) -> None:
+    """Report what is installed, what runs, and how to get what is missing."""
+    findings = examine()
+    width = max(len(finding.name) for finding in findings)
+    for finding in findings:
+        click.echo(f"{finding.name:<{width}}  {finding.value}")
+        if finding.remedy:
+            click.echo(f"{'':<{width}}  -> {finding.remedy}")
+    context.exit(1 if any(finding.fatal for finding in findings) else 0)

@@ -1,0 +1,116 @@
+"""What ``glintbsdf doctor`` reports: the installation, and how to complete it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from . import __version__, llvm
+
+_PACKAGES = ("numpy", "OpenEXR", "scikit-image", "click", "rich", "platformdirs")
+
+# One kernel per variant, in a process of its own: a backend that does not work may abort it.
+_PROBE = """
+import sys
+import glintbsdf, drjit as dr, mitsuba as mi
+for name in sys.argv[1:]:
+    mi.set_variant(name)
+    assert dr.all(dr.minimum(dr.arange(mi.Float, 3) + 1, 2) == mi.Float(1, 2, 2))
+    print(name, flush=True)
+"""
+
+
+class Finding(NamedTuple):
+    """One line of the report.
+
+    ``remedy`` is the exact command for what is missing; ``fatal`` says that without it nothing can
+    be rendered.
+    """
+
+    name: str
+    value: str
+    remedy: str = ""
+    fatal: bool = False
+
+
+def examine() -> list[Finding]:
+    """Examine this installation. Takes a few seconds: every JIT variant computes something."""
+    running = {backend: _running_variants(backend) for backend in ("llvm", "cuda")}
+    nothing_runs = not any(running.values())
+    return [
+        Finding("glintbsdf", __version__),
+        Finding("Python", f"{platform.python_version()} ({sys.executable})"),
+        Finding("System", f"{platform.system()} {platform.machine()}"),
+        Finding("Mitsuba", mi.__version__),
+        Finding("Dr.Jit", dr.__version__),
+        *map(_package, _PACKAGES),
+        *_llvm(),
+        _cuda(),
+        _threads(),
+        _variants(running["llvm"] + running["cuda"], nothing_runs),
+    ]
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, "missing", f"{sys.executable} -m pip install {name}", fatal=True)
+
+
+def _llvm() -> list[Finding]:
+    found = ", ".join(
+        f"{'.'.join(map(str, library.version))} ({library.path})" for library in llvm.find()
+    )
+    version = llvm.loaded_version()
+    loaded = "none" if version is None else ".".join(map(str, version))
+    if path := os.environ.get(llvm.VARIABLE):
+        loaded += f" ({llvm.VARIABLE}={path})"
+    remedy = ""
+    try:
+        llvm.require_usable()
+    except llvm.LLVMError as error:
+        remedy = str(error)
+    return [Finding("LLVM found", found or "none"), Finding("LLVM in use", loaded, remedy)]
+
+
+def _cuda() -> Finding:
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        return Finding("CUDA", "none (optional: needs an NVIDIA GPU and its driver)")
+    driver = ".".join(map(str, dr.detail.cuda_version()))
+    capability = dr.detail.cuda_compute_capability()
+    return Finding("CUDA", f"driver {driver}, compute capability {capability}")
+
+
+def _threads() -> Finding:
+    count = dr.thread_count()
+    remedy = ""
+    if count < 2:
+        remedy = (
+            "With one thread, Mitsuba hangs when it reads OpenEXR files. The command line uses "
+            "two; in Python, type: drjit.set_thread_count(2)"
+        )
+    return Finding("Threads", str(count), remedy)
+
+
+def _running_variants(backend: str) -> list[str]:
+    names = [name for name in mi.variants() if name.startswith(backend)]
+    if backend == "cuda" and not dr.has_backend(dr.JitBackend.CUDA):
+        return []
+    # Those before the first that fails have been printed; a backend mostly runs all or none.
+    probe = subprocess.run(
+        [sys.executable, "-c", _PROBE, *names], capture_output=True, text=True, check=False
+    )
+    return probe.stdout.split()
+
+
+def _variants(running: list[str], fatal: bool) -> Finding:
+    remedy = f"{llvm.install_command()}" if fatal else ""
+    return Finding("Variants that run", ", ".join(running) or "none", remedy, fatal)

@@ -1,0 +1,134 @@
+"""A picture that puts a plugin's P-NDF beside the binned reference, with the error and the time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .errors import check
+from .footprint import Footprint
+from .reference import BinnedPNDF, binned_pndf, texel_covariance
+
+# Points per bin and axis at which the density is evaluated: the reference is the mean over a bin.
+_SUBSAMPLES = 4
+
+# Of the square root of density: fireflies would leave all else black.
+_GAMMA = 0.5
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A P-NDF on the bins of its reference. ``density`` is res x res, rows from low to high y.
+
+    ``seconds`` is the time of the ``queries`` evaluations of the density, compilation excluded.
+    """
+
+    density: np.ndarray
+    reference: BinnedPNDF
+    queries: int
+    seconds: float
+
+    def __str__(self) -> str:
+        error, noise = self.reference.relative_l1(self.density), self.reference.noise_floor
+        return (
+            f"relative L1 difference {error:.2%}, of which noise of the reference {noise:.2%}\n"
+            f"{self.queries} queries in {self.seconds:.3g} s ({self.queries / self.seconds:.3g}/s)"
+        )
+
+    def drawing(self) -> mi.Bitmap:
+        """Draw density and reference side by side on one scale, y upwards."""
+        gap = np.ones((len(self.density), 8, 3))
+        peak = max(self.density.max(), self.reference.density.max())
+        left, right = (
+            colour_map((values / peak)[::-1] ** _GAMMA)
+            for values in (self.density, self.reference.density)
+        )
+        return mi.Bitmap(np.concatenate([left, gap, right], axis=1).astype(np.float32))
+
+
+def compare(
+    plugin: str,
+    map_file: Path,
+    uv: tuple[float, float],
+    sigma: float,
+    res: int,
+    parameters: Mapping[str, str],
+    samples_per_bin: int = 200,
+) -> Comparison:
+    """Evaluate the P-NDF of a plugin under a round footprint, and its reference.
+
+    Args:
+        plugin: type of a glint BSDF.
+        uv: centre of the footprint in UV.
+        sigma: its standard deviation in texels.
+        res: bins along each axis, over the range of the map's normals.
+        parameters: further parameters of the plugin, as strings.
+        samples_per_bin: of the reference, on average.
+
+    Raises:
+        ParameterError: the plugin has no P-NDF to draw.
+    """
+    bsdf = mi.load_dict({"type": plugin, "filename": str(map_file), **_typed(parameters)})
+    pndf = getattr(bsdf, "pndf", None)
+    check(hasattr(pndf, "normal_map"), "pndf", "type", "a glint BSDF with a normal map", plugin)
+    normal_map = pndf.normal_map
+
+    reference = binned_pndf(
+        normal_map,
+        uv,
+        texel_covariance(normal_map, sigma),
+        kernel=pndf.kernel,
+        epsilon=pndf.epsilon,
+        res=res,
+        samples=samples_per_bin * res * res,
+    )
+
+    footprint = Footprint(
+        mi.Point2f(uv),
+        mi.Vector2f(sigma / normal_map.width, 0),
+        mi.Vector2f(0, sigma / normal_map.height),
+    )
+    (x_min, y_min), (x_max, y_max) = reference.bounds
+    count = res * _SUBSAMPLES
+    index = (np.arange(count) + 0.5) / count
+    x, y = np.meshgrid(x_min + (x_max - x_min) * index, y_min + (y_max - y_min) * index)
+    m = mi.Vector2f(mi.Float(x.ravel()), mi.Float(y.ravel()))
+    dr.eval(m)
+
+    pndf.eval(m, footprint).numpy()  # compiles the kernel
+    start = time.perf_counter()
+    density = pndf.eval(m, footprint).numpy()
+    seconds = time.perf_counter() - start
+    density = density.reshape(res, _SUBSAMPLES, res, _SUBSAMPLES).mean(axis=(1, 3))
+    return Comparison(density, reference, count * count, seconds)
+
+
+def colour_map(value: np.ndarray) -> np.ndarray:
+    """Map [0, 1] to linear RGB from black through blue and orange to white, brightness rising."""
+    stops = np.linspace(0, 1, 5)
+    colours = np.array(
+        [[0, 0, 0], [0.05, 0.05, 0.35], [0.55, 0.1, 0.25], [1, 0.5, 0.05], [1, 1, 0.85]]
+    )
+    return np.stack([np.interp(value, stops, channel) for channel in colours.T], axis=-1)
+
+
+def _typed(parameters: Mapping[str, str]) -> dict[str, bool | int | float | str]:
+    """Give strings the type that their spelling suggests, as Mitsuba's dictionaries want it."""
+
+    def typed(text: str) -> bool | int | float | str:
+        if text in ("true", "false"):
+            return text == "true"
+        for number in (int, float):
+            try:
+                return number(text)
+            except ValueError:
+                continue
+        return text
+
+    return {key: typed(text) for key, text in parameters.items()}
