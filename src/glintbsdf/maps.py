@@ -14,7 +14,6 @@ no slopes, because its texels have the same neighbour on both sides.
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
 
 from .errors import check
 from .normalmap import NormalMap
@@ -130,10 +129,10 @@ def _gaussian_noise(shape: tuple[int, int], correlation_lengths: tuple[float, fl
     cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
     exponent = ((np.float32(correlation_lengths[0]) * (cosine * x + sine * y))**2
                 + (np.float32(correlation_lengths[1]) * (cosine * y - sine * x))**2)
-    spectrum = scipy.fft.rfft2(rng.standard_normal(shape, dtype=np.float32))
+    spectrum = np.fft.rfft2(rng.standard_normal(shape, dtype=np.float32))
     spectrum *= np.exp(np.float32(-np.pi**2 / 2) * exponent)
     spectrum[0, 0] = 0
-    noise = scipy.fft.irfft2(spectrum, s=shape)
+    noise = np.fft.irfft2(spectrum, s=shape)
     deviation = noise.std()
     return noise / deviation if deviation > 0 else noise  # constant on a map of one texel
 

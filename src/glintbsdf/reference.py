@@ -9,8 +9,8 @@ texels ``n0 = (i, j)``, ``n1 = (i, j+1)``, ``n2 = (i+1, j)``, ``n3 = (i+1, j+1)`
 ``(n0, n1, n2)`` and ``(n3, n2, n1)``, over which the projected normal is linear. A triangle that
 maps to almost a point would make the density infinite: where twice its area on the disk,
 ``|det J|``, is below ``epsilon``, an equilateral triangle takes its place, centred at
-``(n1 + n2)/2``, of circumradius ``√(2 epsilon / (3√3))`` so that ``|det J| = epsilon``; its corners,
-in the order above, are seen from the centre at 90°, 210° and 330°.
+``(n1 + n2)/2``, of circumradius ``√(2 epsilon / (3√3))`` so that ``|det J| = epsilon``; its
+corners, in the order above, are seen from the centre at 90°, 210° and 330°.
 """
 
 from __future__ import annotations
