@@ -86,7 +86,7 @@ class Parameters:
         }
         if source == "filename":
             check(isinstance(value, str), self.owner, source, "a string", value)
-            return NormalMap.load(Path(mi.file_resolver().resolve(value)), **options)
+            return NormalMap.load(Path(str(mi.file_resolver().resolve(value))), **options)
         if source == "bitmap":
             check(isinstance(value, mi.Bitmap), self.owner, source, "an mi.Bitmap", value)
             return NormalMap.from_bitmap(value, **options)
@@ -99,7 +99,7 @@ class Parameters:
         value = self.props.get("to_uv", mi.ScalarAffineTransform4f())
         check(self.props.type("to_uv") == mi.Properties.Type.Transform if "to_uv" in self.props
               else True, self.owner, "to_uv", "a transform", value)
-        to_uv = mi.ScalarAffineTransform3f(value.extract())
+        to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)
         matrix = to_uv.matrix
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         entries = [matrix[row, column] for row in range(2) for column in range(3)]
