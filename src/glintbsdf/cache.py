@@ -57,7 +57,7 @@ def load_or_build(key: str, build: Callable[[], Mapping[str, np.ndarray]]) -> di
 def _load(path: Path) -> dict[str, np.ndarray] | None:
     """Read a file whole, or return None where there is none or it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except Exception:  # whatever is the matter with the file, it is built again
         return None
