@@ -36,7 +36,7 @@ def main() -> NoReturn:
     except click.Abort:
         sys.exit("Aborted.")
     except click.ClickException as error:
-        error.show()
+        click.echo(f"Error: {one_line(error.format_message())}", err=True)
         sys.exit(error.exit_code)
     except Exception as error:
         if debug:
@@ -161,10 +161,11 @@ def render(
     _activate(variant)
     path = output or scene.with_suffix(".exr")
     columns = ("{task.description}", BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with (
-        rendering.replacing(path) as unfinished,
-        Progress(*columns, console=Console(stderr=True)) as bar,
-    ):
+    terminal = Console(stderr=True)
+    progress = Progress(
+        *columns, console=terminal, transient=True, disable=not terminal.is_terminal
+    )
+    with rendering.replacing(path) as unfinished, progress as bar:
         task = bar.add_task("Loading", total=None)
         loaded = rendering.load_scene(scene, definitions)
 

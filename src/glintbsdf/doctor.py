@@ -42,8 +42,6 @@ class Finding(NamedTuple):
 
 def examine() -> list[Finding]:
     """Examine this installation. Takes a few seconds: every JIT variant computes something."""
-    running = {backend: _running_variants(backend) for backend in ("llvm", "cuda")}
-    nothing_runs = not any(running.values())
     return [
         Finding("glintbsdf", __version__),
         Finding("Python", f"{platform.python_version()} ({sys.executable})"),
@@ -54,7 +52,7 @@ def examine() -> list[Finding]:
         *_llvm(),
         _cuda(),
         _threads(),
-        _variants(running["llvm"] + running["cuda"], nothing_runs),
+        _variants(),
     ]
 
 
@@ -100,17 +98,18 @@ def _threads() -> Finding:
     return Finding("Threads", str(count), remedy)
 
 
-def _running_variants(backend: str) -> list[str]:
-    names = [name for name in mi.variants() if name.startswith(backend)]
-    if backend == "cuda" and not dr.has_backend(dr.JitBackend.CUDA):
-        return []
-    # Those before the first that fails have been printed; a backend mostly runs all or none.
-    probe = subprocess.run(
-        [sys.executable, "-c", _PROBE, *names], capture_output=True, text=True, check=False
-    )
-    return probe.stdout.split()
-
-
-def _variants(running: list[str], fatal: bool) -> Finding:
-    remedy = f"{llvm.install_command()}" if fatal else ""
-    return Finding("Variants that run", ", ".join(running) or "none", remedy, fatal)
+def _variants() -> Finding:
+    running, problem = [], ""
+    for backend in (dr.JitBackend.LLVM, dr.JitBackend.CUDA):
+        if not dr.has_backend(backend):
+            continue
+        prefix = f"{backend.name.lower()}_"
+        names = [name for name in mi.variants() if name.startswith(prefix)]
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE, *names], capture_output=True, text=True, check=False
+        )
+        # Those before the first that fails have been printed; a backend mostly runs all or none.
+        running += probe.stdout.split()
+        if probe.returncode != 0:
+            problem = (probe.stderr.strip() or f"exit status {probe.returncode}").splitlines()[-1]
+    return Finding("Variants that run", ", ".join(running) or "none", problem, not running)

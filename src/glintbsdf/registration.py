@@ -18,6 +18,7 @@ from . import llvm
 
 _PLUGINS = "glintbsdf.plugins"
 _BASE_CLASS = "glintbsdf.bsdf"
+_INTEGRATORS = ("glint_path",)  # all other plugins are BSDFs
 
 
 def plugin_types() -> tuple[str, ...]:
@@ -48,9 +49,10 @@ def register(variant: str) -> None:
     """
     if variant.startswith("scalar"):
         for plugin_type in plugin_types():
-            # The kind of a plugin is known only to its module, which stays unloaded here.
-            mi.register_bsdf(plugin_type, _refuse(plugin_type, variant))
-            mi.register_integrator(plugin_type, _refuse(plugin_type, variant))
+            # Mitsuba remembers the kind of a type across variants: it must be the right one.
+            is_integrator = plugin_type in _INTEGRATORS
+            register_type = mi.register_integrator if is_integrator else mi.register_bsdf
+            register_type(plugin_type, _refuse(plugin_type, variant))
         return
 
     if variant.startswith("llvm"):

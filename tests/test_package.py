@@ -1,0 +1,96 @@
+"""The package as a whole: what importing it does and does not do, and what the README promises."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import glintbsdf
+
+ROOT = Path(__file__).parent.parent
+
+
+def python(script: str) -> str:
+    """Run ``script`` in a fresh interpreter and return what it prints."""
+    process = subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT / "tests",
+    )
+    assert process.returncode == 0, process.stderr
+    return process.stdout.strip()
+
+
+def test_import_is_light_and_chooses_no_variant():
+    output = python(
+        "import sys, glintbsdf, mitsuba\nprint(mitsuba.variant(), *sorted(sys.modules), sep='\\n')"
+    ).splitlines()
+    assert output[0] == "None"
+    heavy = {"numpy", "scipy", "skimage", "OpenEXR", "click", "rich", "matplotlib", "platformdirs"}
+    assert not heavy & set(output)
+
+
+def test_choosing_a_variant_loads_no_image_or_plotting_library(variant):
+    output = python(
+        f"import sys, glintbsdf, mitsuba; mitsuba.set_variant('{variant}'); print(*sys.modules)"
+    )
+    assert not {"skimage", "OpenEXR", "click", "rich", "matplotlib"} & set(output.split())
+
+
+@pytest.mark.parametrize("name", glintbsdf.__all__)
+def test_public_names_load_on_first_use(name):
+    assert getattr(glintbsdf, name) is not None
+    assert name in dir(glintbsdf)
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        glintbsdf.nonsense  # noqa: B018
+
+
+def test_metadata_agree_with_the_package():
+    assert importlib.metadata.version("glintbsdf") == glintbsdf.__version__
+    (autoload,) = importlib.metadata.entry_points(group="mitsuba", name="glintbsdf")
+    assert autoload.load() is glintbsdf
+    assert (Path(glintbsdf.__file__).parent / "py.typed").exists()
+
+
+def test_every_package_folder_is_installed():
+    """setuptools is given a list: a folder missing there would be missing in wheels only."""
+    listed = re.search(r"^packages = \[(.*)\]$", (ROOT / "pyproject.toml").read_text(), re.M)[1]
+    source = ROOT / "src"
+    folders = {
+        ".".join(path.parent.relative_to(source).parts) for path in source.rglob("__init__.py")
+    }
+    assert {name.strip(' "') for name in listed.split(",")} == folders | {"glintbsdf.plugins"}
+
+
+def test_quick_start_is_two_commands():
+    readme = (ROOT / "README.md").read_text()
+    quick_start = readme.split("## Quick start")[1].split("\n## ")[0]
+    commands = re.findall(r"^    (.*)$", quick_start, re.M)
+    assert len(commands) == 2
+    assert all(command.startswith("python3 -m venv .venv && ") for command in commands)
+    for scene in re.findall(r"scenes/\S+\.xml", readme):
+        assert (ROOT / scene).exists()
+
+
+def test_python_example_of_the_readme_runs(tmp_path, variant, monkeypatch):
+    """As printed, at a lower quality."""
+    readme = (ROOT / "README.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.S)
+    assert len([line for line in example.splitlines() if line]) <= 8
+    example = example.replace("llvm_ad_rgb", variant, 1).replace(
+        "spp=64))", "spp=1), write_async=False)"
+    )
+    example = example.replace("box.png", str(tmp_path / "box.png"))
+    monkeypatch.chdir(ROOT)
+    exec(compile(example, "README.md", "exec"), {})
+    assert (tmp_path / "box.png").stat().st_size > 0
