@@ -71,8 +71,9 @@ def parametric(
     rows, columns = s.shape
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, below, opposite = corner + 1, corner + columns, corner + columns + 1
-    triangles = np.concatenate([
-        np.stack([corner, right, below], axis=1), np.stack([opposite, below, right], axis=1)])
+    triangles = np.concatenate(
+        [np.stack([corner, right, below], axis=1), np.stack([opposite, below, right], axis=1)]
+    )
     flat = (a.reshape(-1, a.shape[-1]) for a in (position(s, t), normals, uv(s, t)))
     return Mesh(*flat, triangles)
 
@@ -139,11 +140,11 @@ def spline(points: list[tuple[float, ...]]) -> tuple[CubicSpline, float]:
 
 
 def curved_patch() -> Mesh:
-    """A sail-like square dome, about 1.26 wide and 0.5 high, above the origin; UVs [0, 1]²."""
+    """A sail-like square dome, 1.26 wide and 0.45 high, above the origin; UVs [0, 1]²."""
 
     def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
         x, z = 1.26 * s - 0.63, 1.26 * t - 0.63
-        y = 0.16 + 0.62 * np.cos(1.3 * x) * np.cos(1.3 * z) + 0.10 * x * z
+        y = 0.62 * np.cos(1.6 * x) * np.cos(1.6 * z) + 0.12 * x * z
         return np.stack([x, y, z], axis=-1)
 
     grid = np.linspace(0, 1, 49)
@@ -156,42 +157,87 @@ KETTLE_AXIS_EPSILON = 1e-3  # radius of the hole at a pole, much smaller than a 
 
 def kettle_body() -> Mesh:
     """The kettle's belly from the table (y = 0) to the rim of its lid (radius 0.46)."""
-    outline, length = spline([(0.78, 0.0), (0.90, 0.03), (0.985, 0.15), (1.0, 0.33), (0.95, 0.55),
-                              (0.83, 0.78), (0.65, 0.97), (0.52, 1.06), (0.47, 1.085),
-                              (0.46, 1.06)])
+    outline, length = spline(
+        [
+            (0.78, 0.0),
+            (0.90, 0.03),
+            (0.985, 0.15),
+            (1.0, 0.33),
+            (0.95, 0.55),
+            (0.83, 0.78),
+            (0.65, 0.97),
+            (0.52, 1.06),
+            (0.47, 1.085),
+            (0.46, 1.06),
+        ]
+    )
     # The outline runs upwards and the angle about +y: the normals point outwards.
     return lathe(outline, start=0.0, end=length, segments=96, rings=64, repeats=6)
 
 
 def kettle_lid() -> Mesh:
     """A shallow dome that rests in the rim."""
-    outline, length = spline([(KETTLE_AXIS_EPSILON, 1.20), (0.12, 1.195), (0.25, 1.17),
-                              (0.36, 1.13), (0.425, 1.095), (0.45, 1.065)])
+    outline, length = spline(
+        [
+            (KETTLE_AXIS_EPSILON, 1.20),
+            (0.12, 1.195),
+            (0.25, 1.17),
+            (0.36, 1.13),
+            (0.425, 1.095),
+            (0.45, 1.065),
+        ]
+    )
     return flipped(lathe(outline, start=0.0, end=length, segments=72, rings=24))
 
 
 def kettle_knob() -> Mesh:
     """The lid's knob, black."""
-    outline, length = spline([(KETTLE_AXIS_EPSILON, 1.42), (0.06, 1.415), (0.115, 1.375),
-                              (0.12, 1.33), (0.075, 1.28), (0.05, 1.24), (0.06, 1.19)])
+    outline, length = spline(
+        [
+            (KETTLE_AXIS_EPSILON, 1.42),
+            (0.06, 1.415),
+            (0.115, 1.375),
+            (0.12, 1.33),
+            (0.075, 1.28),
+            (0.05, 1.24),
+            (0.06, 1.19),
+        ]
+    )
     return flipped(lathe(outline, start=0.0, end=length, segments=48, rings=24))
 
 
 def kettle_spout() -> Mesh:
     """A tapering spout towards +x."""
-    path, length = spline([(0.74, 0.34, 0), (1.02, 0.45, 0), (1.22, 0.68, 0), (1.36, 0.95, 0),
-                           (1.54, 1.12, 0)])
-    return tube(path, lambda t: 0.085 + 0.135 * (1 - t / length) ** 2,
-                length=length, segments=48, rings=40)
+    path, length = spline(
+        [(0.74, 0.34, 0), (1.02, 0.45, 0), (1.22, 0.68, 0), (1.36, 0.95, 0), (1.54, 1.12, 0)]
+    )
+    return tube(
+        path, lambda t: 0.085 + 0.135 * (1 - t / length) ** 2, length=length, segments=48, rings=40
+    )
 
 
 def kettle_handle() -> Mesh:
     """The handle, an arch over the lid in the plane z = 0, black."""
-    path, length = spline([(0.73, 0.90, 0), (0.83, 1.20, 0), (0.70, 1.56, 0), (0.36, 1.78, 0),
-                           (0, 1.84, 0), (-0.36, 1.78, 0), (-0.70, 1.56, 0), (-0.83, 1.20, 0),
-                           (-0.73, 0.90, 0)])
-    return tube(path, lambda t: 0.04 + 0.03 * np.exp(-((t / length - 0.5) / 0.22) ** 4),
-                length=length, segments=32, rings=72)
+    path, length = spline(
+        [
+            (0.73, 0.90, 0),
+            (0.83, 1.20, 0),
+            (0.70, 1.56, 0),
+            (0.36, 1.78, 0),
+            (0, 1.84, 0),
+            (-0.36, 1.78, 0),
+            (-0.70, 1.56, 0),
+            (-0.83, 1.20, 0),
+            (-0.73, 0.90, 0),
+        ]
+    )
+    return tube(
+        path,
+        lambda t: 0.04 + 0.03 * np.exp(-(((t / length - 0.5) / 0.22) ** 4)),
+        length=length,
+        segments=32,
+        rings=72,
+    )
 
 
 def cove() -> Mesh:
@@ -205,8 +251,12 @@ def cove() -> Mesh:
         y = bend * (1 - np.cos(angle)) + np.maximum(t - floor - arc, 0)
         return np.stack([s, y, z], axis=-1)
 
-    return parametric(position, np.array([-9.0, 9.0]), np.linspace(0, floor + arc + wall, 65),
-                      lambda s, t: np.stack([s, t], axis=-1))
+    return parametric(
+        position,
+        np.array([-9.0, 9.0]),
+        np.linspace(0, floor + arc + wall, 65),
+        lambda s, t: np.stack([s, t], axis=-1),
+    )
 
 
 def plate() -> Mesh:
@@ -214,8 +264,8 @@ def plate() -> Mesh:
 
     def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
         r = np.hypot(s, t)
-        boss = 0.10 * np.exp(-((r / 0.28) ** 4))
-        ring = -0.035 * np.exp(-(((r - 0.55) / 0.07) ** 2))
+        boss = 0.09 * np.exp(-((r / 0.24) ** 4))
+        ring = -0.03 * np.exp(-(((r - 0.42) / 0.05) ** 2))
         return np.stack([s, boss + ring, -t], axis=-1)
 
     grid = np.linspace(-1, 1, 97)
@@ -251,18 +301,21 @@ def studio(height: int = 128) -> np.ndarray:
     """
     angle = np.pi * (np.arange(2 * height) + 0.5) / height
     azimuth, polar = np.meshgrid(angle, angle[:height])
-    direction = np.stack([np.sin(azimuth) * np.sin(polar), np.cos(polar),
-                          -np.cos(azimuth) * np.sin(polar)], axis=-1)
+    direction = np.stack(
+        [np.sin(azimuth) * np.sin(polar), np.cos(polar), -np.cos(azimuth) * np.sin(polar)], axis=-1
+    )
 
     # Walls: darkest towards the floor, a little cooler above.
     up = 0.5 + 0.5 * direction[..., 1:2]
     radiance = 0.015 + up**2 * np.array([0.035, 0.04, 0.05])
 
     # Azimuth and elevation in degrees; half width, half height, soft edge as tangents; radiance.
-    softboxes = [(80, 65, 0.42, 0.28, 0.12, (1.20, 1.12, 1.00)),
-                 (-60, 28, 0.18, 0.80, 0.10, (0.60, 0.80, 1.10)),
-                 (175, 30, 0.50, 0.20, 0.10, (0.90, 0.62, 0.40)),
-                 (262, 14, 1.10, 0.08, 0.08, (0.25, 0.33, 0.45))]
+    softboxes = [
+        (80, 65, 0.42, 0.28, 0.12, (1.20, 1.12, 1.00)),
+        (-60, 28, 0.18, 0.80, 0.10, (0.60, 0.80, 1.10)),
+        (175, 30, 0.50, 0.20, 0.10, (0.90, 0.62, 0.40)),
+        (262, 14, 1.10, 0.08, 0.08, (0.25, 0.33, 0.45)),
+    ]
     for degrees, elevation, width, tall, edge, colour in softboxes:
         a, e = np.radians(degrees), np.radians(elevation)
         facing = np.array([np.sin(a) * np.cos(e), np.sin(e), -np.cos(a) * np.cos(e)])
@@ -290,8 +343,12 @@ def write_exr(filename: Path, channels: dict[str, np.ndarray]) -> None:
 
 NORMAL_MAPS = {
     "isotropic.exr": lambda: maps.isotropic(MAP_SIZE, seed=1),
-    "scratched.exr": lambda: maps.scratched(MAP_SIZE, seed=2),
-    "brushed.exr": lambda: maps.brushed(MAP_SIZE, seed=3),
+    "scratched.exr": lambda: maps.scratched(
+        MAP_SIZE, coverage=0.8, length=400, width=5, slope=0.4, alpha=0.05, seed=2
+    ),
+    "brushed.exr": lambda: maps.brushed(
+        MAP_SIZE, alpha=0.25, streak_length=60, streak_width=4, seed=3
+    ),
 }
 
 
