@@ -61,7 +61,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.errors import check
-from glintbsdf.raycone import RayCone, lobe_width
+from glintbsdf.raycone import RayCone, curved_interaction, lobe_width
 
 
 class GlintPathIntegrator(mi.SamplingIntegrator):
@@ -119,9 +119,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             si_skip = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, skip)
             pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
 
-        while dr.hint(active, max_iterations=self.max_depth, label="glint_path"):
+        # As part of the loop's state, the sensor's ray would lose its flag has_differentials
+        while dr.hint(
+            active, max_iterations=self.max_depth, exclude=[ray_], label="glint_path"
+        ):
             # The curvature of the surface is what bends ray cones
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
+            si = curved_interaction(pi, ray)
 
             # ---------------------- Direct emission ----------------------
 
@@ -139,11 +142,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             # The sensor's offset rays are intersected with the tangent plane (exact differences);
             # later hits have no offset rays, their partials come from the cone (first order).
-            cone = cone.at(si, ray.d)
-            duv_dx, duv_dy = cone.uv_partials(si)
-            si.compute_uv_partials(ray_)
-            si.duv_dx = dr.select(depth == 0, si.duv_dx, duv_dx)
-            si.duv_dy = dr.select(depth == 0, si.duv_dy, duv_dy)
+            with dr.suspend_grad():
+                cone = cone.at(si, ray.d)
+                duv_dx, duv_dy = cone.uv_partials(si)
+                si.compute_uv_partials(ray_)
+                si.duv_dx = dr.select(depth == 0, si.duv_dx, duv_dx)
+                si.duv_dy = dr.select(depth == 0, si.duv_dy, duv_dy)
 
             # ---------------------- Emitter sampling ----------------------
 
@@ -184,15 +188,14 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             β = β * bsdf_weight
             η *= bs.eta
-            valid |= (
-                active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-            )
+            valid |= active & si.is_valid() & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
-            discrete = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | mi.has_flag(
-                bs.sampled_type, mi.BSDFFlags.Null
-            )
-            spread = dr.select(discrete, 0, lobe_width(bs.pdf, sampler.sample_count()))
-            cone = cone.scattered(si, ray.d, ray_next.d, bs.eta, spread)
+            with dr.suspend_grad():
+                # Mirrors, smooth glass and null interfaces have a discrete density, and no width
+                smooth = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
+                spread = dr.select(smooth, lobe_width(bs.pdf, sampler.sample_count()), 0)
+                cone = cone.scattered(si, ray.d, ray_next.d, bs.eta, spread)
+
             ray = ray_next
 
             # Information about the current vertex needed by the next iteration

@@ -20,8 +20,8 @@ import mitsuba as mi
 if TYPE_CHECKING:
     from typing import Any
 
-# Sine of the angle between dp_du and dp_dv below which a parameterisation counts as degenerate: the
-# rounding noise of the float32 cross product is about 1e-7, so below this the inverse has no digits.
+# Sine of the angle between dp_du and dp_dv below which a parameterisation counts as degenerate. The
+# rounding noise of the float32 cross product is about 1e-7: the inverse keeps two digits here.
 MIN_SINE = 1e-5
 
 
@@ -72,8 +72,10 @@ class Footprint:
         """
         candidates = [(si.duv_dx, si.duv_dy)]
         if hasattr(si, "footprint"):
-            # Drop columns of a matrix through its transpose: indexing a matrix gives rows.
-            candidates.append(tuple(mi.Vector2f(row) for row in dr.transpose(si.footprint)))
+            diameters = si.footprint
+            candidates.append(
+                tuple(mi.Vector2f(diameters[0, k], diameters[1, k]) for k in range(2))
+            )
         if not is_literal_zero(pixel_spread):
             candidates.append(cone_partials(si, si.t * pixel_spread))
 

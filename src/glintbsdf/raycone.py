@@ -126,6 +126,34 @@ class RayCone:
         return RayCone(self.dp_x, self.dp_y, self.dd_x + x * spread, self.dd_y + y * spread)
 
 
+def curved_interaction(
+    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
+) -> mi.SurfaceInteraction3f:
+    """The surface interaction of ``pi`` with all fields, the derivatives of its shading normal
+    ``dn_du`` and ``dn_dv`` included.
+
+    Mitsuba 3.9 reports these by barycentric coordinates when the shape is a mesh (and by UV for all
+    other shapes, as the next release does for all). They are converted here, by the edges of the
+    triangle. A mesh inside an instance counts as flat: its edges are known before the instance's
+    transformation only.
+    """
+    if not hasattr(mi.RayFlags, "dNSdUV"):
+        return pi.compute_surface_interaction(ray, mi.RayFlags.Default | mi.RayFlags.NormalPartials)
+
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
+    is_mesh = si.shape.is_mesh()
+    known = is_mesh & (si.instance == None)  # noqa: E711 (a comparison per lane)
+    mesh = mi.MeshPtr(si.shape)
+    p0, p1, p2 = (mesh.vertex_position(i, known) for i in mesh.face_indices(si.prim_index, known))
+    duv1, duv2 = (tangent_to_uv(si.dp_du, si.dp_dv, edge) for edge in (p1 - p0, p2 - p0))
+    inv_det = dr.rcp(duv1.x * duv2.y - duv1.y * duv2.x)
+    inv_det = dr.select(known & dr.isfinite(inv_det), inv_det, 0)
+    dn_db1, dn_db2 = si.dn_du, si.dn_dv
+    si.dn_du = dr.select(is_mesh, (dn_db1 * duv2.y - dn_db2 * duv1.y) * inv_det, dn_db1)
+    si.dn_dv = dr.select(is_mesh, (dn_db2 * duv1.x - dn_db1 * duv2.x) * inv_det, dn_db2)
+    return si
+
+
 def lobe_width(pdf: mi.Float, sample_count: int) -> mi.Float:
     """Width in radians of the part of a lobe that one of its samples stands for.
 
