@@ -150,22 +150,25 @@ def test_old_files_go(folder, monkeypatch):
         os.utime(path, (1000 + i, 1000 + i))
     size = path.stat().st_size
     cache.load_or_build("key 0", forbidden)  # used last
-    stale, fresh = folder / "killed.tmp", folder / "running.tmp"
-    stale.write_bytes(b"half")
-    fresh.write_bytes(b"half")
-    os.utime(stale, (1000, 1000))
+    stale, fresh = folder / "glintbsdf-killed.tmp", folder / "glintbsdf-running.tmp"
+    foreign = [folder / "mine.tmp", folder / "mine.npz"]
+    for file in (stale, fresh, *foreign):
+        file.write_bytes(b"half")
+    for file in (stale, *foreign):
+        os.utime(file, (1000, 1000))
 
     monkeypatch.setattr(cache, "LIMIT", 2.5 * size)
     cache.load_or_build("key 3", builder)
     assert not stale.exists() and fresh.exists()
-    assert len(list(folder.glob("*.npz"))) == 2
+    assert len(list(folder.glob("glintbsdf-*.npz"))) == 2
     cache.load_or_build("key 0", forbidden)
     cache.load_or_build("key 3", forbidden)
 
     monkeypatch.setattr(cache, "LIMIT", 1)
     cache.load_or_build("key 4", builder)
     cache.load_or_build("key 4", forbidden)
-    assert len(list(folder.glob("*.npz"))) == 1
+    assert len(list(folder.glob("glintbsdf-*.npz"))) == 1
+    assert all(file.exists() for file in foreign)
 
 
 def hammer(seed):

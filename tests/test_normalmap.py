@@ -100,8 +100,9 @@ def test_auto_tells_heights_from_normals():
 
 def test_normals_need_no_unit_length():
     normals = random_normals()
-    np.testing.assert_allclose(NormalMap.from_array(3 * normals).normals, normals[..., :2],
-                               atol=1e-7)
+    for length in (1e-30, 3, 1e30):
+        data = (length * normals).astype(np.float32)
+        np.testing.assert_allclose(NormalMap.from_array(data).normals, normals[..., :2], atol=2e-7)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
@@ -161,6 +162,16 @@ def test_exr_normals(tmp_path, dtype, tolerance, names):
         np.testing.assert_allclose(loaded.normals, normals[..., :2], atol=tolerance)
     write_exr(path, {f"layer.{name}": values for name, values in channels.items()})
     np.testing.assert_array_equal(NormalMap.load(path).normals, loaded.normals)
+
+
+def test_exr_layers_are_not_mixed(tmp_path):
+    normals = random_normals().astype(np.float32)
+    other = np.full(SHAPE, 0.1, np.float32)
+    channels = {f"b.{name}": normals[..., i] for i, name in enumerate("XYZ")}
+    for extra in ({"Z": other}, {"a.X": other, "a.Y": other}, {"c.X": other, "c.Z": other}):
+        write_exr(tmp_path / "map.exr", channels | extra)
+        np.testing.assert_allclose(NormalMap.load(tmp_path / "map.exr").normals, normals[..., :2],
+                                   atol=1e-7)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -281,6 +292,10 @@ BAD_DATA = {
                 "x² \\+ y² < 1 (got \"1 outside the disk; the first at row 2, column 2"),
     "height NaN": (changed(random_heights(), (2, 5), value=np.nan), {},
                    "finite heights (got \"1 NaN or infinite; the first at row 2, column 5"),
+    "steep": (changed(random_heights(), (2, 3), value=1e30), {}, "a height with slopes below 1000"
+              ".* (got \"4 steeper; the first at row 1, column 3"),
+    "steep by overflow": (changed(random_heights(), (2, 3), (2, 5), value=1.7e308),
+                          {"height_scale": -4.0}, "slopes below 1000"),
     "height of colours": (random_normals(), {"map_type": "height"},
                           "a height, .* (got \"3 channels that differ\")"),
     "height of two": (random_normals()[..., :2], {"map_type": "height"}, "(got \"2 channels\")"),

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 LIMIT = 4 << 30  # bytes
+_PREFIX = "glintbsdf-"  # the directory may hold files of others, which are never touched
 _STALE = 3600  # seconds after which an unfinished file can only be what a killed process left
 
 
@@ -46,7 +47,7 @@ def load_or_build(key: str, build: Callable[[], Mapping[str, np.ndarray]]) -> di
     folder = directory()
     if folder is None:
         return dict(build())
-    path = folder / f"{hashlib.blake2b(key.encode(), digest_size=20).hexdigest()}.npz"
+    path = folder / f"{_PREFIX}{hashlib.blake2b(key.encode(), digest_size=20).hexdigest()}.npz"
     arrays = _load(path)
     if arrays is None:
         arrays = dict(build())
@@ -75,7 +76,8 @@ def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         raise TypeError("only plain arrays can be cached, not arrays of Python objects")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=_PREFIX, suffix=".tmp",
+                                         delete=False) as file:
             try:
                 np.savez(file, **arrays)
                 file.close()
@@ -96,10 +98,10 @@ def _tidy(folder: Path) -> None:
     """
     now, total = time.time(), 0
     with contextlib.suppress(OSError):
-        for entry in folder.glob("*.tmp"):
+        for entry in folder.glob(f"{_PREFIX}*.tmp"):
             if now - entry.stat().st_mtime > _STALE:
                 entry.unlink()
-        used = sorted(((entry.stat(), entry) for entry in folder.glob("*.npz")),
+        used = sorted(((entry.stat(), entry) for entry in folder.glob(f"{_PREFIX}*.npz")),
                       key=lambda pair: pair[0].st_mtime, reverse=True)
         for position, (status, entry) in enumerate(used):
             total += status.st_size

@@ -35,8 +35,9 @@ WRAP_MODES = ("repeat", "mirror", "clamp")
 MAP_TYPES = ("auto", "normal", "height")
 
 _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
+_MAX_SLOPE = 1000
 
-# Channel names of an EXR file, in the order in which they are read; what is left out is ignored.
+# What makes a map among the channels of an EXR file, the most telling names first.
 _EXR_LAYOUTS = (("R", "G", "B"), ("X", "Y", "Z"), ("R", "G"), ("X", "Y"), ("Y",))
 
 
@@ -112,11 +113,12 @@ class NormalMap:
              wrap_mode: str = "repeat", owner: str = "NormalMap") -> NormalMap:
         """Read a map from an image file.
 
-        OpenEXR (half, float, unsigned integer; channels R,G,B or X,Y,Z or R,G or X,Y or Y, or a
-        single channel of any name; others, such as alpha, are ignored), TIFF, and what
-        ``mi.Bitmap`` reads (PNG, JPEG, BMP, TGA, PFM, PPM, HDR), in 8 or 16 bits per channel or
-        floating point. Alpha is ignored. Raises :class:`~glintbsdf.errors.ParameterError` where the
-        file is missing, unreadable, or holds no valid map.
+        OpenEXR (half, float, unsigned integer; channels R,G,B or X,Y,Z or R,G or X,Y or Y, in a
+        layer or not, or a single channel of any name; others, such as alpha, are ignored), TIFF
+        (as :meth:`from_array`), and what ``mi.Bitmap`` reads (PNG, JPEG, BMP, TGA, PFM, PPM, HDR;
+        alpha is ignored), in 8 or 16 bits per channel or floating point. Raises
+        :class:`~glintbsdf.errors.ParameterError` where the file is missing, unreadable, or holds no
+        valid map.
         """
         path = Path(filename)
         check(path.is_file(), owner, "filename", "the name of an existing file", str(filename))
@@ -222,9 +224,13 @@ def _normals_from_height(height: np.ndarray, height_scale: float, wrap_mode: str
     # Mirrored about the border, the texel beyond it is the border texel itself, as when clamped.
     padded = np.pad(height, 1, mode="wrap" if wrap_mode == "repeat" else "edge")
     scale = 0.5 * float(height_scale)
-    slope_x = scale * (padded[1:-1, 2:] - padded[1:-1, :-2])
-    slope_y = scale * (padded[2:, 1:-1] - padded[:-2, 1:-1])
-    length = np.sqrt(1 + slope_x**2 + slope_y**2)
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        slope_x = scale * (padded[1:-1, 2:] - padded[1:-1, :-2])
+        slope_y = scale * (padded[2:, 1:-1] - padded[:-2, 1:-1])
+        length = np.hypot(np.hypot(slope_x, slope_y), 1)
+    # Steeper ones would be horizontal in float32.
+    _check_texels(owner, parameter, f"a height with slopes below {_MAX_SLOPE}, after height_scale",
+                  {"steeper": ~(length < _MAX_SLOPE)})
     return np.stack((-slope_x / length, -slope_y / length), axis=2)
 
 
@@ -236,7 +242,8 @@ def _project(vectors: np.ndarray, owner: str, parameter: str) -> np.ndarray:
         "NaN or infinite": ~finite,
         "zero": zero,
         "down-facing": finite & ~zero & ~(vectors[..., 2] > 0)})
-    return vectors[..., :2] / np.linalg.norm(vectors, axis=2, keepdims=True)
+    length = np.sqrt(np.einsum("ijk,ijk->ij", vectors, vectors, dtype=np.float64))
+    return vectors[..., :2] / length[..., None]
 
 
 # -------------------------------------------------------------------------------------------------
@@ -267,15 +274,17 @@ def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
-        # "layer.R" is channel R: only the last part of a name says what the channel is.
-        channels = {name.rpartition(".")[2].upper(): channel.pixels
-                    for name, channel in file.channels().items()}
-    channels.pop("A", None)
-    if len(channels) == 1:
-        return next(iter(channels.values()))
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    # "layer.R" is channel R of a layer; those without a layer come first.
+    layers = sorted({name.rpartition(".")[0] for name in channels})
     for layout in _EXR_LAYOUTS:
-        if channels.keys() >= set(layout):
-            return np.stack([channels[name] for name in layout], axis=2)
+        for layer in layers:
+            names = [f"{layer}.{name}" if layer else name for name in layout]
+            if all(name in channels for name in names):
+                return np.stack([channels[name] for name in names], axis=2)
+    colours = [name for name in channels if name.rpartition(".")[2] != "A"]
+    if len(colours) == 1:
+        return channels[colours[0]]
     raise ValueError(f"no channels R,G,B or X,Y,Z or R,G or X,Y or Y among {', '.join(channels)}")
 
 
