@@ -85,7 +85,8 @@ class TexelKernel:
         reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
     """
 
-    def __init__(self, kernel: str, footprint: Footprint, width: int, height: int, wrap_mode: str):
+    def __init__(self, kernel: str, footprint: Footprint, height: int, width: int,
+                 wrap_mode: str) -> None:
         check_choice("TexelKernel", "kernel", kernel, KERNELS)
         self.kernel = kernel
         uv = footprint.uv
@@ -93,7 +94,8 @@ class TexelKernel:
             # The strips beyond the edges are constant: a footprint six maps outside sees what is there for ever.
             uv = dr.clip(uv, -6.0, 7.0)
         else:
-            uv = uv - dr.floor(uv)
+            period = 2 if wrap_mode == "mirror" else 1
+            uv = uv - period * dr.floor(uv * (1 / period))
         size = mi.Vector2f(width, height)
         self.mean = mi.Point2f(dr.fma(uv, size, -0.5))
 
@@ -147,6 +149,10 @@ class TexelKernel:
         sin_phi, cos_phi = dr.sincos(2 * pi * sample.y)
         v = self.sigma_v * rho * sin_phi
         return mi.Vector2f(dr.fma(self.shear, v, self.sigma_u_given_v * rho * cos_phi), v)
+
+    def touched_quads(self):
+        """Number of quads that the support's bounding box touches, on average over its place."""
+        return dr.fma(2, self.reach_u, 1) * dr.fma(2, self.reach_v, 1)
 
     def row_extent(self, top, bottom):
         """Extent (left, right) in texels, relative to the mean, of the support within rows [top, bottom].

@@ -1,7 +1,9 @@
-"""The P-NDF of the position-normal manifold (Wu et al. 2024), exact.
+"""The P-NDF of the position-normal manifold, exact.
 
-The map's texels are the vertices of a triangle mesh in position × normal space; the P-NDF is the mesh seen
-along the position axes. Functions stand in the paper's order, with its symbols.
+Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
+High-Resolution Normal Maps" (2024), section 4.1. The map's texels are the vertices of a triangle
+mesh in position × normal space; the P-NDF is that mesh seen along the position axes. The functions
+stand in the paper's order and use its symbols.
 """
 
 from __future__ import annotations
@@ -10,19 +12,17 @@ from math import sqrt
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..cache import load_or_build
 from ..errors import check, check_choice
 from ..kernels import KERNELS, TexelKernel
+from ..lattice import Lattice, floor_int
+from ..normalmap import NormalMap
+from .quad_lists import QuadLists, every_quad
 
-
-# ----------------------------------------------------------------------------------------------------------------
-#  Section 4.1: the mesh
-# ----------------------------------------------------------------------------------------------------------------
-
-
-def floor_int(x):
-    """The largest integer ≤ x, as ``mi.Int``."""
-    return mi.Int(dr.floor(x))
+#: Footprints that touch no more quads than this are summed quad by quad; larger ones use the lists.
+FEW_QUADS = 25
 
 
 def cross(a, b):
@@ -30,132 +30,237 @@ def cross(a, b):
     return dr.fma(a.x, b.y, -(a.y * b.x))
 
 
+# ------------------------------------------------------------------------------------------------
+#  Eq. 4 and "Preventing Jacobian singularity": the effective triangles
+# ------------------------------------------------------------------------------------------------
+
+
+def equilateral(epsilon):
+    """The triangle that replaces one with |det J| < ε: first vertex from its centre, and two edges.
+
+    Its own Jacobian is exactly ε. Returns three pairs of Python floats ``(a, e1, e2)``.
+    """
+    r = sqrt(2 * epsilon / (3 * sqrt(3)))  # circumradius of an equilateral triangle of area ε/2
+    return (0, r), (-sqrt(0.75) * r, -1.5 * r), (sqrt(0.75) * r, -1.5 * r)
+
+
 def effective_triangle(a, b, c, centre, epsilon):
-    """The normal triangle n(Δ) that evaluation, sampling and all bounds agree on: (first vertex, edges, |det J|).
+    """The normal triangle n(Δ) on which sampling, evaluation and all bounds agree.
 
-    ``a``, ``b``, ``c`` (``mi.Vector2f``): projected normals at the vertices. A triangle with |det J| < ε is replaced
-    by an equilateral one around ``centre`` whose Jacobian is exactly ε (paragraph "Preventing Jacobian
-    singularity"), barycentric order kept.
-
-    Returns ``(a, e1, e2, det)``, signed det J = e1 × e2 (Eq. 4).
+    ``a``, ``b``, ``c``, ``centre`` (``mi.Vector2f``): projected normals at the vertices, and where
+    the replacement of a degenerate triangle is centred. Returns the first vertex and the edges
+    ``e1``, ``e2`` from it to the second and third.
     """
     e1, e2 = b - a, c - a
-    det = cross(e1, e2)
-    tiny = dr.abs(det) < epsilon
-    r = sqrt(2 * epsilon / (3 * sqrt(3)))  # circumradius of an equilateral triangle of area ε/2
-    a = dr.select(tiny, mi.Vector2f(centre.x, centre.y + r), a)
-    e1 = dr.select(tiny, mi.Vector2f(-sqrt(0.75) * r, -1.5 * r), e1)
-    e2 = dr.select(tiny, mi.Vector2f(sqrt(0.75) * r, -1.5 * r), e2)
-    return a, e1, e2, dr.select(tiny, epsilon, det)
-
-
-def quad_triangles(n0, n1, n2, n3, epsilon):
-    """The two effective triangles of a quad, (n0, n1, n2) and (n3, n2, n1) (Fig. 3)."""
-    centre = 0.5 * (n1 + n2)
+    tiny = dr.abs(cross(e1, e2)) < epsilon
+    small_a, small_e1, small_e2 = (mi.Vector2f(*v) for v in equilateral(epsilon))
     return (
-        effective_triangle(n0, n1, n2, centre, epsilon),
-        effective_triangle(n3, n2, n1, centre, epsilon),
+        dr.select(tiny, centre + small_a, a),
+        dr.select(tiny, small_e1, e1),
+        dr.select(tiny, small_e2, e2),
     )
 
 
-def intersect(m, triangle):
-    """Barycentric coordinates (λ1, λ2) of ``m`` in a triangle, and whether it lies inside (Eq. 5)."""
-    a, e1, e2, det = triangle
-    q = m - a
-    inverse = dr.rcp(det)
-    l1, l2 = cross(q, e2) * inverse, cross(e1, q) * inverse
-    return l1, l2, (l1 >= 0) & (l2 >= 0) & (l1 + l2 <= 1)
+# ------------------------------------------------------------------------------------------------
+#  Eq. 5: evaluation
+# ------------------------------------------------------------------------------------------------
 
 
-def quad_density(m, corner, kernel, normals, epsilon):
-    """Contribution of one quad to D(m) (Eq. 5).
+def quad_density(m, corner, kernel, normals, epsilon, active):
+    """What one quad adds to D(m) (Eq. 5): k(u* − x) / |det J| for each triangle that contains m.
 
-    ``corner`` (``mi.Vector2f``): position of n0 relative to the footprint's mean, texels. ``normals``: (n0, n1, n2, n3).
+    The triangles (n0, n1, n2) and (n3, n2, n1) share the diagonal e = n2 − n1, so barycentric
+    coordinates are taken from n1: m − n1 = λ0 (n0 − n1) + λ2 e in the one, λ3 (n3 − n1) + λ2' e in
+    the other. A point lies in both only where the mesh folds over between them, which is rare
+    enough for the second kernel value to stand in a branch; so do degenerate triangles.
+
+    Args:
+        m (mi.Vector2f): projected normal.
+        corner (mi.Vector2f): position of n0 from the footprint's centre, texels.
+        kernel (TexelKernel): k.
+        normals: projected normals (n0, n1, n2, n3), ``mi.Vector2f``.
+        epsilon (float): smallest |det J|.
     """
-    upper, lower = quad_triangles(*normals, epsilon)
-    l1, l2, hit = intersect(m, upper)
-    density = dr.select(hit, kernel.value(corner + mi.Vector2f(l1, l2)) / dr.abs(upper[3]), 0)
-    l1, l2, hit = intersect(m, lower)
-    return density + dr.select(
-        hit, kernel.value(corner + mi.Vector2f(1 - l1, 1 - l2)) / dr.abs(lower[3]), 0
+    n0, n1, n2, n3 = normals
+    e, a0, a3, q = n2 - n1, n0 - n1, n3 - n1, m - n1
+    det_upper, det_lower, across = cross(e, a0), cross(e, a3), cross(e, q)
+    tiny_upper, tiny_lower = dr.abs(det_upper) < epsilon, dr.abs(det_lower) < epsilon
+    inverse_upper, inverse_lower = dr.rcp(det_upper), dr.rcp(det_lower)
+
+    l0, l2 = across * inverse_upper, cross(q, a0) * inverse_upper
+    in_upper = (l0 >= 0) & (l2 >= 0) & (l0 + l2 <= 1) & ~tiny_upper
+    u_upper = corner + mi.Vector2f(1 - l0 - l2, l2)
+
+    l3, l2 = across * inverse_lower, cross(q, a3) * inverse_lower
+    in_lower = (l3 >= 0) & (l2 >= 0) & (l3 + l2 <= 1) & ~tiny_lower
+    u_lower = corner + mi.Vector2f(1 - l2, l2 + l3)
+
+    in_any = in_upper | in_lower
+    # Lanes outside must stay finite: 0 · ∞ would be NaN in the derivatives.
+    u = dr.select(in_upper, u_upper, dr.select(in_lower, u_lower, corner))
+    inverse = dr.select(in_upper, inverse_upper, dr.select(in_lower, inverse_lower, 0))
+    density = dr.select(in_any, kernel.value(u) * dr.abs(inverse), 0)
+
+    def add_fold(density):
+        u = dr.select(in_lower, u_lower, corner)
+        return (density + kernel.value(u) * dr.abs(dr.select(in_lower, inverse_lower, 0)),)
+
+    (density,) = dr.if_stmt(
+        (density,), active & in_upper & in_lower, add_fold, lambda density: (density,), label="fold"
     )
+
+    def add_degenerate(density):
+        a, e1, e2 = equilateral(epsilon)
+        p = m - 0.5 * (n1 + n2) - mi.Vector2f(*a)
+        l1, l2 = (p.x * e2[1] - p.y * e2[0]) / epsilon, (e1[0] * p.y - e1[1] * p.x) / epsilon
+        inside = (l1 >= 0) & (l2 >= 0) & (l1 + l2 <= 1)
+        upper = kernel.value(corner + mi.Vector2f(l1, l2)) / epsilon
+        lower = kernel.value(corner + mi.Vector2f(1 - l1, 1 - l2)) / epsilon
+        return (
+            density
+            + dr.select(inside & tiny_upper, upper, 0)
+            + dr.select(inside & tiny_lower, lower, 0),
+        )
+
+    (density,) = dr.if_stmt(
+        (density,),
+        active & (tiny_upper | tiny_lower),
+        add_degenerate,
+        lambda density: (density,),
+        label="degenerate",
+    )
+    return density
 
 
 class Manifold:
-    """Exact P-NDF of a normal map (Wu24, Eq. 5), with its exact sampler (Eq. 6).
+    """Exact P-NDF of a normal map (Eq. 5) and its exact sampler (Eq. 6).
+
+    Belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
         normal_map (NormalMap): the map.
-        kernel (str): footprint kernel, ``gaussian``, ``disk`` or ``box``.
-        epsilon (float): smallest Jacobian |det J|, > 0.
+        kernel (str): ``gaussian``, ``disk`` or ``box``, see :mod:`glintbsdf.kernels`.
+        epsilon (float): smallest Jacobian determinant |det J| of a triangle, in (0, 1).
+        owner (str): whom errors name, usually the plugin.
+
+    Attributes:
+        data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
+            change of its values, :meth:`parameters_changed` rebuilds the lists.
+
+    Raises :class:`~glintbsdf.errors.ParameterError`.
     """
 
-    def __init__(self, normal_map, kernel: str = "gaussian", epsilon: float = 1e-6, owner="Manifold"):
+    def __init__(self, normal_map: NormalMap, kernel: str = "gaussian", epsilon: float = 1e-6,
+                 owner: str = "Manifold") -> None:
         check_choice(owner, "kernel", kernel, KERNELS)
-        check(0 < epsilon < 1, owner, "epsilon", "between 0 and 1, both excluded", epsilon)
-        self.kernel, self.epsilon = kernel, float(epsilon)
-        self.normal_map = normal_map
+        check(0 < epsilon < 1, owner, "epsilon", "a number in (0, 1)", epsilon)
+        self.normal_map, self.kernel, self.epsilon = normal_map, kernel, float(epsilon)
+        self.owner = owner
         self.data = mi.TensorXf(normal_map.normals)
+        key = f"manifold {QuadLists.VERSION} {normal_map.content_hash} {self.epsilon!r}"
+        self.build(lambda build: load_or_build(key, build))
 
-    def texel_kernel(self, footprint) -> TexelKernel:
-        m = self.normal_map
-        return TexelKernel(self.kernel, footprint, m.width, m.height, m.wrap_mode)
+    def build(self, cached=lambda build: build()) -> None:
+        """Make everything that depends on ``self.data``; ``cached`` may know the lists already."""
+        height, width, _ = self.data.shape
+        self.lattice = Lattice(height, width, self.normal_map.wrap_mode)
+        texel = mi.UInt32(self.lattice.source)
+        vertices = dr.gather(mi.Vector2f, self.data.array, texel)
+        self.vertices = dr.ravel(vertices)
+        dr.eval(self.vertices)
+        self.lists = QuadLists(
+            self.lattice,
+            cached(lambda: QuadLists.build(
+                self.lattice, self.effective_triangles, self.data.numpy().reshape(-1, 2),
+                self.bounds(),
+            )),
+        )
 
-    def wrap(self, i, n):
-        if self.normal_map.wrap_mode == "clamp":
-            return dr.clip(i, 0, n - 1)
-        if self.normal_map.wrap_mode == "mirror":
-            i = i - mi.Int(dr.floor(mi.Float(i) / (2 * n))) * (2 * n)
-            return dr.minimum(i, 2 * n - 1 - i)
-        i = i % n
-        return dr.select(i < 0, i + n, i)
-
-    def quad_normals(self, i, j, active):
-        w, h = self.normal_map.width, self.normal_map.height
-        i0, i1 = self.wrap(i, h) * w, self.wrap(i + 1, h) * w
-        j0, j1 = self.wrap(j, w), self.wrap(j + 1, w)
+    def quad_normals(self, row, column, active=True):
+        """Projected normals n0…n3 of a stored quad (Eq. 3)."""
         return [
-            dr.gather(mi.Vector2f, self.data.array, mi.UInt32(k), active)
-            for k in (i0 + j0, i0 + j1, i1 + j0, i1 + j1)
+            dr.gather(mi.Vector2f, self.vertices, mi.UInt32(index), active)
+            for index in self.lattice.corners(row, column)
         ]
 
-    @dr.syntax
-    def eval(self, m, footprint, active=True):
-        kernel = self.texel_kernel(footprint)
-        active = mi.Bool(active)
-        density = mi.Float(0)
-        i = floor_int(kernel.mean.y - kernel.reach_v)
-        i_end = floor_int(kernel.mean.y + kernel.reach_v)
-        j_first = floor_int(kernel.mean.x - kernel.reach_u)
-        j_end = floor_int(kernel.mean.x + kernel.reach_u)
-        j = mi.Int(j_first)
-        while dr.hint(active & (i <= i_end), max_iterations=-1, exclude=[self, kernel]):
-            n = self.quad_normals(i, j, active)
-            corner = mi.Vector2f(j, i) - kernel.mean
-            density += quad_density(m, corner, kernel, n, self.epsilon)
-            j += 1
-            last = j > j_end
-            j = dr.select(last, j_first, j)
-            i = dr.select(last, i + 1, i)
-        return dr.select(active & (dr.squared_norm(m) < 1), density, 0)
+    def effective_triangles(self, row, column, active=True):
+        """The two effective triangles of a stored quad, without derivatives."""
+        with dr.suspend_grad():
+            n0, n1, n2, n3 = self.quad_normals(row, column, active)
+            centre = 0.5 * (n1 + n2)
+            return (
+                effective_triangle(n0, n1, n2, centre, self.epsilon),
+                effective_triangle(n3, n2, n1, centre, self.epsilon),
+            )
 
-    def sample(self, footprint, sample1, sample2, active=True):
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest rectangle (lower, upper) of projected normals that holds all triangles."""
+        normals = self.data.numpy().reshape(-1, 2)
+        reach = equilateral(self.epsilon)[0][1] * 1.001
+        return normals.min(0) - reach, normals.max(0) + reach
+
+    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk (Eq. 5); 0 outside of it.
+
+        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
+        """
+        kernel = self.texel_kernel(footprint)
+        active = mi.Bool(active) & (dr.squared_norm(m) < 1) & self.lists.covers(m)
+        few = kernel.touched_quads() <= FEW_QUADS
+
+        def add(density, row, column, corner, active):
+            normals = self.quad_normals(row, column, active)
+            added = quad_density(m, corner, kernel, normals, self.epsilon, active)
+            return density + dr.select(active, added, 0)
+
+        density = every_quad(self.lattice, kernel, add, active & few)
+        return density + self.lists.visit(m, kernel, add, active & ~few)
+
+    def sample(self, footprint, sample1, sample2: mi.Point2f,
+               active: bool | mi.Bool = True) -> mi.Vector2f:
+        """Draw a projected normal with density D (Eq. 6): the normal at a place drawn from k.
+
+        One that falls outside the disk is an invalid sample, as D is 0 there. ``sample1`` is not
+        needed.
+        """
         kernel = self.texel_kernel(footprint)
         u = kernel.mean + kernel.sample(sample2)
-        j, i = floor_int(u.x), floor_int(u.y)
-        l1, l2 = u.x - j, u.y - i
-        upper, lower = quad_triangles(*self.quad_normals(i, j, active), self.epsilon)
-        in_upper = l1 + l2 < 1
-        a, e1, e2 = (dr.select(in_upper, p, q) for p, q in zip(upper[:3], lower[:3], strict=True))
-        l1, l2 = dr.select(in_upper, l1, 1 - l1), dr.select(in_upper, l2, 1 - l2)
+        column, row = floor_int(u.x), floor_int(u.y)
+        l1, l2 = u.x - column, u.y - row
+        n0, n1, n2, n3 = self.quad_normals(
+            self.lattice.y.locate(row)[1], self.lattice.x.locate(column)[1], active
+        )
+        upper = l1 + l2 < 1
+        l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
+        a, e1, e2 = effective_triangle(
+            dr.select(upper, n0, n3), dr.select(upper, n1, n2), dr.select(upper, n2, n1),
+            0.5 * (n1 + n2), self.epsilon,
+        )
         return a + e1 * l1 + e2 * l2
 
-    def traverse(self, callback):
+    def texel_kernel(self, footprint) -> TexelKernel:
+        """k(u − x) of Eq. 2 for this map."""
+        height, width, _ = self.data.shape
+        return TexelKernel(self.kernel, footprint, height, width, self.normal_map.wrap_mode)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys=()):
-        pass
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check new data, and rebuild. Derivatives keep flowing to them."""
+        if keys and "data" not in keys:
+            return
+        self.normal_map = NormalMap(
+            self.data.numpy(), wrap_mode=self.normal_map.wrap_mode, owner=self.owner
+        )
+        self.build()
 
     @property
-    def nbytes(self):
-        return self.data.array.size * 4 if hasattr(self.data.array, "size") else 0
+    def nbytes(self) -> int:
+        """Memory of vertices and lists, bytes."""
+        return 4 * dr.width(self.vertices) + self.lists.nbytes
+
+    def __repr__(self) -> str:
+        height, width, _ = self.data.shape
+        return (f"Manifold[{width}×{height} texels, {self.normal_map.wrap_mode}, "
+                f"kernel={self.kernel}, epsilon={self.epsilon:g}, {self.nbytes / 2**20:.1f} MiB]")

@@ -1,0 +1,83 @@
+"""The lattice of texels: the whole plane, from the finite map that repeats, mirrors or stretches over it.
+
+Texel (row i, column j) has its centre at the position (x, y) = (j, i). The quad (i, j) spans four
+texels, (i, j) to (i+1, j+1): the plane is tiled by quads. What the P-NDFs store per quad, they store
+for a finite rectangle of quads, and this module says which of them a quad of the plane looks like.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Quads are grouped in square blocks of this side. A power of two.
+BLOCK = 8
+
+
+def floor_int(x):
+    """The largest integer ≤ ``x``, as ``mi.Int``."""
+    return mi.Int(dr.floor(x))
+
+
+class Axis:
+    """One axis of the lattice: ``texels`` texels, wrapped by ``wrap_mode``.
+
+    Attributes:
+        quads (int): quads stored. ``repeat``: one period; ``mirror``: a period of 2 × ``texels``;
+            ``clamp``: the map between two borders of whole blocks, which stand for the constant
+            strips that go on for ever.
+        source (int32 array of ``quads + 1``): the texel shown by each stored vertex.
+    """
+
+    def __init__(self, texels: int, wrap_mode: str) -> None:
+        self.clamped = wrap_mode == "clamp"
+        if self.clamped:
+            inner_blocks = -(-(BLOCK + texels - 1) // BLOCK)
+            self.quads = (inner_blocks + 1) * BLOCK
+            self.source = np.clip(np.arange(self.quads + 1) - BLOCK, 0, texels - 1)
+        elif wrap_mode == "mirror":
+            self.quads = 2 * texels
+            index = np.arange(self.quads + 1) % self.quads
+            self.source = np.minimum(index, self.quads - 1 - index)
+        else:
+            self.quads = texels
+            self.source = np.arange(self.quads + 1) % self.quads
+        self.blocks = -(-self.quads // BLOCK)
+
+    def locate(self, x):
+        """Where the quad at the position ``x`` (``mi.Int``, texels) is stored.
+
+        Returns ``(origin, index, end)``: ``x = origin + index`` with ``index`` in [0, ``quads``),
+        and all of [``index``, ``end``) is stored from this origin on without a break.
+        """
+        if not self.clamped:
+            origin = floor_int((mi.Float(x) + 0.5) * (1 / self.quads)) * self.quads
+            return origin, x - origin, mi.Int(self.quads)
+        last = self.quads - BLOCK
+        x = x + BLOCK
+        before, after = x < 0, x >= last
+        beyond = dr.select(before, x, dr.select(after, x - last, 0))
+        origin = beyond & -BLOCK  # whole blocks, rounded down
+        end = dr.select(before, BLOCK, dr.select(after, self.quads, last))
+        return origin - BLOCK, x - origin, end
+
+
+class Lattice:
+    """The lattice of a map of ``height`` × ``width`` texels.
+
+    Attributes:
+        x, y (Axis): columns and rows.
+        pitch (int): stored vertices per row.
+        source (uint32 array): flat index of the texel shown by each stored vertex, row by row.
+    """
+
+    def __init__(self, height: int, width: int, wrap_mode: str) -> None:
+        self.x, self.y = Axis(width, wrap_mode), Axis(height, wrap_mode)
+        self.pitch = self.x.quads + 1
+        self.source = (self.y.source[:, None] * width + self.x.source).astype(np.uint32).ravel()
+
+    def corners(self, row, column):
+        """Indices of the four vertices n0, n1, n2, n3 of a stored quad (``mi.UInt32``)."""
+        n0 = row * self.pitch + column
+        return n0, n0 + 1, n0 + self.pitch, n0 + self.pitch + 1

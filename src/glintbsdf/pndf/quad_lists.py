@@ -1,0 +1,431 @@
+"""Point location in the manifold, inverted: for every normal, the quads that can show it.
+
+The plane of projected normals is cut into cells, the lattice of texels into rows of blocks. For
+every (row of blocks, cell) there is a list of the quads of the row whose normals reach into the
+cell, from left to right, with the list's subdivision by blocks. A query has one cell; every row of
+blocks under its footprint is then one run of consecutive entries, whatever the footprint's shape:
+no tree, no stack, nothing visited that is not near in both position and normal.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..lattice import BLOCK, Lattice, floor_int
+from ..progress import progress
+
+SHIFT = BLOCK.bit_length() - 1  # quad to block
+
+#: Resolution per axis of the table that maps a normal to its cell.
+RESOLUTION = 1024
+
+#: Cells per axis that are tried, the finest that fits being taken.
+DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
+
+#: Memory allowed, bytes per quad, the vertices not counted.
+BYTES_PER_QUAD = 48
+
+#: Half width (in units of projected normals) by which bounds are widened against rounding.
+MARGIN = 1e-6
+
+#: Counters of one strip of the build: bounds what the build needs on top of its result.
+STRIP_COUNTERS = 1 << 23
+
+
+# ------------------------------------------------------------------------------------------------
+#  Queries
+# ------------------------------------------------------------------------------------------------
+
+
+def every_quad(lattice: Lattice, kernel, add, active):
+    """Sum over all quads that the kernel's bounding box touches, row by row; see ``QuadLists.visit``.
+
+    The right loop for footprints of a few texels, where searching costs more than it saves.
+    """
+    mean = mi.Vector2f(kernel.mean)
+    left = floor_int(mean.x - kernel.reach_u)
+    right = floor_int(mean.x + kernel.reach_u)
+    bottom = floor_int(mean.y + kernel.reach_v)
+
+    def body(x, y, active, density):
+        corner = mi.Vector2f(x, y) - mean
+        density = add(density, lattice.y.locate(y)[1], lattice.x.locate(x)[1], corner, active)
+        x = x + 1
+        new_row = x > right
+        y = dr.select(new_row, y + 1, y)
+        return dr.select(new_row, left, x), y, active & (y <= bottom), density
+
+    y = floor_int(mean.y - kernel.reach_v)
+    state = (mi.Int(left), y, mi.Bool(active), mi.Float(0))
+    return dr.while_loop(
+        state, lambda x, y, active, density: active, body, max_iterations=-1, label="every quad"
+    )[3]
+
+
+class Packed:
+    """An array of unsigned integers, two to a word where 16 bits are enough."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.half = values.dtype == np.uint16
+        if self.half:
+            values = np.append(values, np.zeros(len(values) % 2, np.uint16)).view(np.uint32)
+        self.words = mi.UInt32(values)
+        self.nbytes = values.nbytes
+
+    def __getitem__(self, item):
+        """Gather, ``item`` = (index, active)."""
+        index, active = item
+        if not self.half:
+            return dr.gather(mi.UInt32, self.words, index, active)
+        word = dr.gather(mi.UInt32, self.words, index >> 1, active)
+        return (word >> ((index & 1) << 4)) & 0xFFFF
+
+
+class NormalCells:
+    """Division of a rectangle of projected normals into S×S cells.
+
+    S slabs along x, each cut into S cells along y, at places that are half uniform, half quantiles
+    of the map's normals: small cells where the normals, hence the queries, are many.
+    """
+
+    def __init__(self, lower, upper, slab_of_x: np.ndarray, cell_of_y: np.ndarray) -> None:
+        """``slab_of_x`` (RESOLUTION), ``cell_of_y`` (S, RESOLUTION): tables over the rectangle."""
+        self.lower, self.upper = (np.asarray(v, np.float32) for v in (lower, upper))
+        self.divisions = len(cell_of_y)
+        self.scale = (RESOLUTION / (self.upper - self.lower)).astype(np.float32)
+        self.slab_of_x = mi.UInt32(slab_of_x.astype(np.uint32))
+        self.cell_of_y = mi.UInt32(cell_of_y.astype(np.uint32).ravel())
+
+    @staticmethod
+    def tables(normals: np.ndarray, lower, upper, divisions: int):
+        """The tables ``(slab_of_x, cell_of_y)`` for these normals, (N, 2)."""
+        pixel = ((normals - lower) * (RESOLUTION / (upper - lower))).astype(np.int64)
+        x, y = np.clip(pixel, 0, RESOLUTION - 1).T
+
+        def cut(counts):
+            mass = np.cumsum(counts) / max(counts.sum(), 1)
+            uniform = np.arange(1, RESOLUTION + 1) / RESOLUTION
+            before = 0.5 * (np.append(0, mass[:-1]) + np.append(0, uniform[:-1]))
+            return np.minimum(before * divisions, divisions - 1).astype(np.uint8)
+
+        slab_of_x = cut(np.bincount(x, minlength=RESOLUTION))
+        joint = np.bincount(
+            slab_of_x[x].astype(np.int64) * RESOLUTION + y, minlength=divisions * RESOLUTION
+        )
+        return slab_of_x, np.stack([cut(row) for row in joint.reshape(divisions, RESOLUTION)])
+
+    def pixel(self, value, axis):
+        """Position of a coordinate in the table, in pixels."""
+        return (value - self.lower[axis]) * self.scale[axis]
+
+    def covers(self, m):
+        """Whether ``m`` lies in the rectangle."""
+        x, y = self.pixel(m.x, 0), self.pixel(m.y, 1)
+        return (x >= 0) & (x < RESOLUTION) & (y >= 0) & (y < RESOLUTION)
+
+    def slab(self, x, active=True):
+        index = mi.UInt32(dr.clip(self.pixel(x, 0), 0, RESOLUTION - 1))
+        return dr.gather(mi.UInt32, self.slab_of_x, index, active)
+
+    def cell_in_slab(self, slab, y, active=True):
+        index = mi.UInt32(dr.clip(self.pixel(y, 1), 0, RESOLUTION - 1))
+        return dr.gather(mi.UInt32, self.cell_of_y, slab * RESOLUTION + index, active)
+
+    def cell(self, m, active=True):
+        """Index of the cell of ``m``."""
+        slab = self.slab(m.x, active)
+        return slab * self.divisions + self.cell_in_slab(slab, m.y, active)
+
+    def edges(self) -> tuple[mi.Float, mi.Float]:
+        """Lower edges of the slabs (S + 1), and of the cells of each slab (S, S + 1), flat."""
+        wanted = np.arange(self.divisions + 1)
+        slabs = np.searchsorted(self.slab_of_x.numpy(), wanted)
+        cells = [
+            np.searchsorted(row, wanted)
+            for row in self.cell_of_y.numpy().reshape(self.divisions, RESOLUTION)
+        ]
+        x = self.lower[0] + slabs / self.scale[0]
+        y = self.lower[1] + np.concatenate(cells) / self.scale[1]
+        return mi.Float(x.astype(np.float32)), mi.Float(y.astype(np.float32))
+
+
+class QuadLists:
+    """The lists. Build the arrays with :meth:`build`, wherever they are kept, then make one of these.
+
+    Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
+        ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
+        ``entries``: quads as ``column << SHIFT | row in block``;
+        ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
+    """
+
+    VERSION = 1
+
+    def __init__(self, lattice: Lattice, arrays: dict[str, np.ndarray]) -> None:
+        self.lattice = lattice
+        self.cells = NormalCells(
+            arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
+        )
+        self.entries, self.offset = Packed(arrays["entries"]), Packed(arrays["offset"])
+        self.start = mi.UInt32(arrays["start"])
+        self.nbytes = self.entries.nbytes + self.offset.nbytes + arrays["start"].nbytes
+
+    def covers(self, m):
+        """Whether any quad may show the normal ``m``."""
+        return self.cells.covers(m)
+
+    def visit(self, m, kernel, add, active) -> mi.Float:
+        """Sum over all quads that may show ``m`` under the kernel.
+
+        Calls ``add(density, row, column, corner, active)`` for quads (row, column) of the lattice,
+        ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
+        it returns the new ``density``. One flat loop, because lanes that walk nested loops wait for
+        each other at the end of every inner one. Sums are differentiable in both modes.
+        """
+        columns, rows = self.lattice.x, self.lattice.y
+        mean = mi.Vector2f(kernel.mean)
+        count = self.cells.divisions**2
+        cell = self.cells.cell(m, active)
+        bottom = floor_int(mean.y + kernel.reach_v)
+
+        def next_row(x, right, next_y, origin_y, row, list_index):
+            """The next row of blocks, and its extent under the kernel."""
+            origin_y, y, end = rows.locate(next_y)
+            block = y >> SHIFT
+            row = block << SHIFT
+            next_y = origin_y + dr.minimum(row + BLOCK, end)
+            start, stop = kernel.row_extent(
+                mi.Float(origin_y + row) - mean.y, mi.Float(next_y) - mean.y
+            )
+            x, right = floor_int(mean.x + start), floor_int(mean.x + stop)
+            return x, right, next_y, origin_y, row, mi.UInt32(block) * count + cell
+
+        def next_run(entry, end, x, right, y, next_y, origin_x, origin_y, row, list_index, active):
+            """The next run of consecutive entries."""
+            new_row = active & (x > right)
+            y = dr.select(new_row, next_y, y)
+            x, right, next_y, origin_y, row, list_index = dr.if_stmt(
+                (x, right, next_y, origin_y, row, list_index),
+                new_row, next_row, lambda *state: state, label="next row",
+            )
+            active = active & (y <= bottom)
+            origin_x, column, column_end = columns.locate(x)
+            last = dr.minimum(right - origin_x, column_end - 1) >> SHIFT
+            first_offset = list_index * (columns.blocks + 1)
+            start = dr.gather(mi.UInt32, self.start, list_index, active)
+            entry = start + self.offset[first_offset + mi.UInt32(column >> SHIFT), active]
+            end = start + self.offset[first_offset + mi.UInt32(last + 1), active]
+            x = origin_x + dr.minimum((last + 1) << SHIFT, column_end)
+            return entry, end, x, right, y, next_y, origin_x, origin_y, row, list_index, active
+
+        def body(*state):
+            *run, density = state
+            entry, end, active = run[0], run[1], run[-1]
+            run = dr.if_stmt(
+                tuple(run), active & (entry >= end), next_run, lambda *run: run, label="next run"
+            )
+            entry, end, _, _, _, _, origin_x, origin_y, row, _, active = run
+            found = active & (entry < end)
+            quad = mi.Int(self.entries[entry, found])
+            quad_row, quad_column = row + (quad & (BLOCK - 1)), quad >> SHIFT
+            corner = mi.Vector2f(origin_x + quad_column, origin_y + quad_row) - mean
+            density = add(density, quad_row, quad_column, corner, found)
+            return entry + 1, *run[1:], density
+
+        none = mi.Int(0)
+        y = floor_int(mean.y - kernel.reach_v)
+        run = (mi.UInt32(0), mi.UInt32(0), none, none - 1, y, y, none, none, none, mi.UInt32(0))
+        state = (*(type(v)(v) for v in run), mi.Bool(active), mi.Float(0))
+        return dr.while_loop(
+            state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
+        )[-1]
+
+    # --------------------------------------------------------------------------------------------
+    #  Building
+    # --------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def build(lattice: Lattice, triangles, normals: np.ndarray, bounds) -> dict[str, np.ndarray]:
+        """Build the arrays, in two passes over the lattice: count, then fill.
+
+        ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
+        and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
+        rectangle (lower, upper), inside which all triangles lie.
+        """
+        return _Builder(lattice, triangles, normals, bounds).arrays()
+
+
+def reaches(triangle, centre, half):
+    """Whether a triangle meets a rectangle (separating axes), both given as ``mi.Vector2f``.
+
+    ``triangle``: first vertex and two edges; ``centre``, ``half``: centre and half extents.
+    """
+    a, e1, e2 = triangle
+    a = a - centre
+    b, c = a + e1, a + e2
+    lower, upper = dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
+    meets = dr.all((lower <= half) & (upper >= -half))
+    for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
+        normal = mi.Vector2f(-edge.y, edge.x)
+        radius = dr.dot(dr.abs(normal), half)
+        p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
+        meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
+    return meets
+
+
+class _Builder:
+    """Scan of all quads against all cells they reach, one lane per block of quads.
+
+    A lane alone touches the counters of its block, so the order of the entries, and with it every
+    later sum, is the same on all machines.
+    """
+
+    def __init__(self, lattice, triangles, normals, bounds) -> None:
+        self.lattice, self.triangles, self.normals = lattice, triangles, normals
+        self.lower, self.upper = (np.asarray(v, np.float32) for v in bounds)
+        self.rows, self.columns = lattice.y.blocks, lattice.x.blocks
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= BYTES_PER_QUAD)
+        tables = self.use(divisions)
+        cells = divisions**2
+        row_quads = self.lattice.x.quads * BLOCK
+        index_type = np.uint16 if row_quads < 1 << 16 else np.uint32
+
+        offset = np.zeros((self.rows, cells, self.columns + 1), index_type)
+        total = np.zeros((self.rows, cells), np.int64)
+        step = max(1, STRIP_COUNTERS // (cells * (self.columns + 1)))
+        strips = [slice(k, min(k + step, self.rows)) for k in range(0, self.rows, step)]
+        with progress("Building lists of quads") as report:
+            for done, strip in enumerate(strips):
+                counts = self.scan_strip(strip, np.zeros_like(offset[strip], np.uint32))
+                ends = np.cumsum(counts, axis=-1, dtype=np.uint32)
+                offset[strip, :, 1:] = ends[..., :-1]
+                total[strip] = ends[..., -1]
+                report(0.5 * (done + 1) / len(strips))
+            start = np.cumsum(total.ravel()) - total.ravel()
+
+            entries = np.empty(total.sum(), index_type)
+            for done, strip in enumerate(strips):
+                first = start[strip.start * cells]
+                count = total[strip].sum()
+                place = start.reshape(total.shape)[strip, :, None] - first + offset[strip]
+                entries[first : first + count] = self.scan_strip(
+                    strip, place.astype(np.uint32), count
+                )
+                report(0.5 + 0.5 * (done + 1) / len(strips))
+        return {
+            "lower": self.lower,
+            "upper": self.upper,
+            "slab_of_x": tables[0],
+            "cell_of_y": tables[1],
+            "start": start.astype(np.uint32),
+            "offset": offset.ravel(),
+            "entries": entries,
+        }
+
+    def use(self, divisions: int):
+        """Divide the normals into ``divisions``² cells; returns the tables."""
+        tables = NormalCells.tables(self.normals, self.lower, self.upper, divisions)
+        self.cells = NormalCells(self.lower, self.upper, *tables)
+        self.slab_edges, self.cell_edges = self.cells.edges()
+        return tables
+
+    def bytes_per_quad(self, divisions: int) -> float:
+        """Memory of the lists with so many divisions, estimated from a sample of blocks."""
+        self.use(divisions)
+        sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
+        row, column = (mi.UInt32(v) for v in divmod(sample, self.columns))
+        counter = dr.zeros(mi.UInt32, 1)
+        self.scan(row, column, lambda cell: mi.UInt32(0), counter)
+        entries = counter[0] / (len(sample) * BLOCK**2)
+        return 2 * entries + (2 + 6 / (self.columns + 1)) * (divisions / BLOCK) ** 2
+
+    def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
+        """Scan the rows of blocks of a strip.
+
+        ``counters`` (rows, cells, columns + 1) count the quads per list and block; with ``entries``,
+        they say where the next entry goes, and the entries are returned instead.
+        """
+        shape = counters.shape
+        block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
+        row, column = block // self.columns, block % self.columns
+        counters = mi.UInt32(counters.ravel())
+        filled = None if entries is None else dr.zeros(mi.UInt32, max(int(entries), 1))
+        self.scan(
+            row + dr.opaque(mi.UInt32, strip.start),
+            column,
+            lambda cell: (row * shape[1] + cell) * shape[2] + column,
+            counters,
+            filled,
+        )
+        if filled is None:
+            return counters.numpy().reshape(shape)
+        return filled.numpy()[:entries]
+
+    def scan(self, block_row, block_column, counter_of_cell, counters, entries=None) -> None:
+        """For all quads of the given blocks, count or enter them in the cells that they reach."""
+        lattice, cells = self.lattice, self.cells
+
+        def cell_range(slab, lower, upper, active):
+            return (
+                mi.Int(cells.cell_in_slab(mi.UInt32(slab), lower - MARGIN, active)),
+                mi.Int(cells.cell_in_slab(mi.UInt32(slab), upper + MARGIN, active)),
+            )
+
+        def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active):
+            quad = quad + 1
+            active = active & (quad < BLOCK**2)
+            row = block_row * BLOCK + (quad >> SHIFT)
+            column = block_column * BLOCK + (quad & (BLOCK - 1))
+            exists = active & (row < lattice.y.quads) & (column < lattice.x.quads)
+            first, second = (
+                tuple(mi.Vector2f(v) for v in t) for t in self.triangles(row, column, exists)
+            )
+            corners = [t[0] + e for t in (first, second) for e in (mi.Vector2f(0), t[1], t[2])]
+            lowest, highest = corners[0], corners[0]
+            for corner in corners[1:]:
+                lowest, highest = dr.minimum(lowest, corner), dr.maximum(highest, corner)
+            slab = mi.Int(cells.slab(lowest.x - MARGIN, exists))
+            last_slab = dr.select(exists, mi.Int(cells.slab(highest.x + MARGIN, exists)), -1)
+            cell, last_cell = cell_range(slab, lowest.y, highest.y, exists)
+            return (quad, slab, last_slab, cell, last_cell, lowest.y, highest.y, first, second,
+                    active)
+
+        def body(*state):
+            state = dr.if_stmt(
+                state, state[-1] & (state[1] > state[2]), next_quad, lambda *state: state,
+                label="next quad",
+            )
+            quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active = state
+            inside = active & (slab <= last_slab)
+            s, c = mi.UInt32(slab), mi.UInt32(cell)
+            x = [dr.gather(mi.Float, self.slab_edges, s + k, inside) for k in range(2)]
+            index = s * (cells.divisions + 1) + c
+            y = [dr.gather(mi.Float, self.cell_edges, index + k, inside) for k in range(2)]
+            centre = mi.Vector2f(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
+            half = mi.Vector2f(0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])) + MARGIN
+            found = inside & (reaches(first, centre, half) | reaches(second, centre, half))
+            slot = dr.scatter_inc(counters, counter_of_cell(s * cells.divisions + c), found)
+            if entries is not None:
+                column = block_column * BLOCK + (quad & (BLOCK - 1))
+                dr.scatter(entries, (column << SHIFT) | (quad >> SHIFT), slot, found)
+
+            cell = cell + 1
+            next_slab = inside & (cell > last_cell)
+            slab = dr.select(next_slab, slab + 1, slab)
+            first_cell, final_cell = cell_range(slab, lower, upper, next_slab & (slab <= last_slab))
+            cell = dr.select(next_slab, first_cell, cell)
+            last_cell = dr.select(next_slab, final_cell, last_cell)
+            return (quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active)
+
+        n = dr.width(block_row)
+        none, zero = dr.zeros(mi.Int, n), dr.zeros(mi.Float, n)
+        triangle = tuple(dr.zeros(mi.Vector2f, n) for _ in range(3))
+        state = (
+            dr.full(mi.UInt32, 0xFFFFFFFF, n), none + 0, none - 1, none + 0, none - 1,
+            zero + 0, zero + 0, triangle, tuple(v + 0 for v in triangle), dr.full(mi.Bool, True, n),
+        )
+        dr.while_loop(state, lambda *state: state[-1], body, label="scan of quads")
+        dr.eval(counters, entries)
