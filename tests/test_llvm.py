@@ -114,6 +114,19 @@ def test_too_old_a_library_is_an_error_before_drjit_aborts(too_old, usable):
     assert f"export {llvm.VARIABLE}={usable.path}" in process.stderr
 
 
+def test_too_late_an_import_says_what_to_change(too_old, usable):
+    """Dr.Jit has put its variables on the old library by now: it cannot be replaced."""
+    process = python(
+        "import os, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        f"del os.environ['{llvm.VARIABLE}']\n"
+        "import glintbsdf",
+        too_old.path,
+    )
+    assert process.returncode == 1
+    assert "Import glintbsdf before the first LLVM variant is chosen" in process.stderr
+    assert f"export {llvm.VARIABLE}={usable.path}" in process.stderr
+
+
 def test_too_old_a_library_does_not_hinder_scalar_variants(too_old):
     script = "import glintbsdf, mitsuba as mi; mi.set_variant('scalar_rgb')"
     assert python(script, too_old.path).returncode == 0

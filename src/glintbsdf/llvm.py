@@ -87,9 +87,14 @@ def require_usable() -> None:
         )
     if usable is None:
         remedy = f"Type: {install_command()}" + (f" && unset {VARIABLE}" if named else "")
-    else:
-        # Found, but out of reach: another one is named, or Mitsuba was at work before us.
+    elif named:
         remedy = f"Before Python starts, type: export {VARIABLE}={usable.path}"
+    else:
+        # Found, but too late to take its place: an LLVM variant was active before us.
+        remedy = (
+            "Import glintbsdf before the first LLVM variant is chosen, or, before Python starts, "
+            f"type: export {VARIABLE}={usable.path}"
+        )
     raise LLVMError(f"{problem}, but version {MINIMUM_VERSION} or newer is needed. {remedy}")
 
 
@@ -223,5 +228,4 @@ def _restart_drjit() -> None:
     except (OSError, AttributeError):
         return
     shutdown(ctypes.c_int(0))
-    every_backend = sum(1 << int(backend) for backend in (1, 2, 3))
-    init(ctypes.c_uint32(every_backend))
+    init(ctypes.c_uint32(1 << 1 | 1 << 2 | 1 << 3))  # CUDA, LLVM, Metal
