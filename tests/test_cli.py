@@ -267,15 +267,11 @@ def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
     images = {}
     for size in (1 << 18, 512):
         monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", size)
-        dones, totals = [], []
-
-        def report(done, total, dones=dones, totals=totals):
-            dones.append(done)
-            totals.append(total)
-
-        bitmap = rendering.render(rendering.load_scene("scene.xml"), 16, 0, report)
-        images[totals[0]] = np.array(bitmap)
-        assert dones == list(range(totals[0] + 1)) and len(set(totals)) == 1
+        fractions = []
+        bitmap = rendering.render(rendering.load_scene("scene.xml"), 16, 0, fractions.append)
+        passes = len(fractions)
+        images[passes] = np.array(bitmap)
+        assert fractions == [(index + 1) / passes for index in range(passes)]
     assert set(images) == {1, 8}
     assert not np.array_equal(images[1], images[8])
     # A white furnace seen in a mirror: the image differs from 1 by lost multiple reflections only.
@@ -285,10 +281,10 @@ def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
 
 def test_stratified_samplers_render_in_one_pass(folder, variant, monkeypatch):
     monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", 256)
-    totals = []
+    fractions = []
     scene = rendering.load_scene("scene.xml", {"sampler": "multijitter"})
-    rendering.render(scene, report=lambda _done, total: totals.append(total))
-    assert set(totals) == {1}
+    rendering.render(scene, report=fractions.append)
+    assert fractions == [1]
 
 
 def test_each_variant_renders(folder, each_variant):

@@ -13,11 +13,10 @@ from typing import NoReturn
 import click
 import drjit as dr
 import mitsuba as mi
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from . import __version__, llvm, pndf_plot, rendering
 from .doctor import examine
+from .progress import progress
 
 Definitions = tuple[str, ...]
 
@@ -160,19 +159,12 @@ def render(
     """
     _activate(variant)
     path = output or scene.with_suffix(".exr")
-    columns = ("{task.description}", BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    terminal = Console(stderr=True)
-    progress = Progress(
-        *columns, console=terminal, transient=True, disable=not terminal.is_terminal
-    )
-    with rendering.replacing(path) as unfinished, progress as bar:
-        task = bar.add_task("Loading", total=None)
+    with rendering.replacing(path) as unfinished:
+        # Plugins show the progress of what they build while the scene loads.
         loaded = rendering.load_scene(scene, definitions)
-
-        def report(done: int, total: int) -> None:
-            bar.update(task, description="Rendering", completed=done, total=total)
-
-        rendering.save(rendering.render(loaded, spp, seed, report), unfinished)
+        with progress("Rendering") as report:
+            bitmap = rendering.render(loaded, spp, seed, report)
+        rendering.save(bitmap, unfinished)
     click.echo(path)
 
 

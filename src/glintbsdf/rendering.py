@@ -76,14 +76,14 @@ def render(
     scene: mi.Scene,
     spp: int | None = None,
     seed: int = 0,
-    report: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[float], None] = lambda fraction: None,
 ) -> mi.Bitmap:
     """Render the first sensor of ``scene`` and return its developed film.
 
     The image is the mean of several passes with seeds derived from ``seed``, and ``report`` is
-    called with the number of passes done and their total, first with 0 done. A sampler that
-    stratifies the samples of a pixel would lose by that and renders in one pass. Footprint
-    parameters of the scene's BSDFs are overwritten, see :func:`set_footprints`.
+    called with the fraction done after each. A sampler that stratifies the samples of a pixel would
+    lose by that and renders in one pass. Footprint parameters of the scene's BSDFs are overwritten,
+    see :func:`set_footprints`.
 
     Args:
         spp: samples per pixel; None for what the scene says. Mitsuba rounds it up where the
@@ -101,7 +101,6 @@ def render(
         passes = _pass_count(spp, int(np.prod(sensor.film().crop_size())))
     set_footprints(scene, sensor, spp, passes)
 
-    report(0, passes)
     total: np.ndarray | float = 0.0
     for index in range(passes):
         # Seeds of neighbouring images must not share passes.
@@ -109,7 +108,7 @@ def render(
         scene.integrator().render(scene, sensor, seed=pass_seed, spp=spp // passes)
         bitmap = sensor.film().bitmap()
         total = total + np.array(bitmap, dtype=np.float64)
-        report(index + 1, passes)
+        report((index + 1) / passes)
     np.asarray(bitmap)[...] = total / passes
     return bitmap
 
