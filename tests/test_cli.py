@@ -243,8 +243,10 @@ def test_passes_have_the_footprint_of_the_whole_image(folder, variant, passes, o
     """What a BSDF sees is σ times the spread of a pass, and σ times the differentials of a pass."""
     scene = rendering.load_scene("scene.xml", {"spread": str(own_spread)})
     sensor = scene.sensors()[0]
-    rendering.set_footprints(scene, sensor, 16, passes)
-    spread, sigma = footprint_parameters(scene)
+    before = footprint_parameters(scene)
+    with rendering.footprints(scene, sensor, 16, passes):
+        spread, sigma = footprint_parameters(scene)
+    assert footprint_parameters(scene) == before
     whole = own_spread or rendering.pixel_angle(sensor) / np.sqrt(16)
     assert spread * sigma == pytest.approx(0.5 * whole, rel=1e-5)
     assert sigma / np.sqrt(16 / passes) == pytest.approx(0.5 / np.sqrt(16), rel=1e-5)
@@ -268,7 +270,9 @@ def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
     for size in (1 << 18, 512):
         monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", size)
         fractions = []
-        bitmap = rendering.render(rendering.load_scene("scene.xml"), 16, 0, fractions.append)
+        scene = rendering.load_scene("scene.xml")
+        bitmap = rendering.render(scene, 16, 0, fractions.append)
+        assert scene.sensors()[0].sampler().sample_count() == 16
         passes = len(fractions)
         images[passes] = np.array(bitmap)
         assert fractions == [(index + 1) / passes for index in range(passes)]

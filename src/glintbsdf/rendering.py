@@ -48,8 +48,9 @@ def pixel_angle(sensor: mi.Sensor) -> float:
     return float(np.asarray(dr.sqrt(dr.sqrt(squared))).item())
 
 
-def set_footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: int = 1) -> None:
-    """Give all glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel.
+@contextmanager
+def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: int = 1) -> Iterator[None]:
+    """Give all glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel, in the block.
 
     A BSDF whose ``pixel_spread`` is 0 gets the sensor's pixel angle, scaled by 1/√spp as Mitsuba
     scales ray differentials. Where the image is the mean of ``passes`` renderings, Mitsuba scales
@@ -57,14 +58,21 @@ def set_footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: int = 1
     taken out of the ``pixel_spread`` that a scene has set itself.
     """
     parameters = mi.traverse(scene)
+    parameters.keep([r".*(pixel_spread|footprint_sigma)$"])
+    original = {key: mi.Float(parameters[key]) for key in parameters.keys()}
     spread = pixel_angle(sensor) / (spp / passes) ** 0.5
-    for key in list(parameters.keys()):
+    for key, own in original.items():
         if key.endswith("pixel_spread"):
-            own = parameters[key]
             parameters[key] = dr.select(own > 0, own * passes**0.5, spread)
-        elif key.endswith("footprint_sigma") and passes > 1:
-            parameters[key] = parameters[key] / passes**0.5
+        else:
+            parameters[key] = own / passes**0.5
     parameters.update()
+    try:
+        yield
+    finally:
+        for key, own in original.items():
+            parameters[key] = own
+        parameters.update()
 
 
 # ---------------------------------------------------------------------------------------------
@@ -82,8 +90,7 @@ def render(
 
     The image is the mean of several passes with seeds derived from ``seed``, and ``report`` is
     called with the fraction done after each. A sampler that stratifies the samples of a pixel would
-    lose by that and renders in one pass. Footprint parameters of the scene's BSDFs are overwritten,
-    see :func:`set_footprints`.
+    lose by that and renders in one pass. BSDFs see the pixels' footprints, see :func:`footprints`.
 
     Args:
         spp: samples per pixel; None for what the scene says. Mitsuba rounds it up where the
@@ -99,16 +106,17 @@ def render(
     passes = 1
     if sampler.class_name() == "IndependentSampler":
         passes = _pass_count(spp, int(np.prod(sensor.film().crop_size())))
-    set_footprints(scene, sensor, spp, passes)
 
     total: np.ndarray | float = 0.0
-    for index in range(passes):
-        # Seeds of neighbouring images must not share passes.
-        pass_seed = mi.sample_tea_32(seed, index)[0] if passes > 1 else seed
-        scene.integrator().render(scene, sensor, seed=pass_seed, spp=spp // passes)
-        bitmap = sensor.film().bitmap()
-        total = total + np.array(bitmap, dtype=np.float64)
-        report((index + 1) / passes)
+    with footprints(scene, sensor, spp, passes):
+        for index in range(passes):
+            # Seeds of neighbouring images must not share passes.
+            pass_seed = mi.sample_tea_32(seed, index)[0] if passes > 1 else seed
+            scene.integrator().render(scene, sensor, seed=pass_seed, spp=spp // passes)
+            bitmap = sensor.film().bitmap()
+            total = total + np.array(bitmap, dtype=np.float64)
+            report((index + 1) / passes)
+    sampler.set_sample_count(spp)  # which the last pass has left at its own
     np.asarray(bitmap)[...] = total / passes
     return bitmap
 
