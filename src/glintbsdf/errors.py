@@ -1,4 +1,4 @@
-"""The one sentence in which every parameter error is told: who, which, what is allowed, what came."""
+"""The one sentence that tells a parameter error: who, which, what is allowed, what came."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ class ParameterError(ValueError):
 
 
 def describe(value: object) -> str:
-    """Show a value as it is quoted in an error: strings in double quotes, everything else by repr."""
+    """Show a value as an error quotes it: strings in double quotes, everything else by repr."""
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 

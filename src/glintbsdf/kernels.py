@@ -1,11 +1,13 @@
 """Footprint kernels k(u − x) on the texel lattice.
 
-A footprint is a Gaussian in UV (``footprint.py``); a P-NDF weighs the texels it covers with one of three
-kernels, all defined by the Mahalanobis distance ρ in the whitened footprint and all of unit integral:
+A footprint is a Gaussian in UV (``footprint.py``); a P-NDF weighs the texels it covers with one of
+three kernels, all defined in the whitened footprint, where ρ is the Mahalanobis distance, and all
+of unit integral:
 
 * ``gaussian``: exp(−ρ²/2), cut at ρ ≤ 3 and renormalised;
 * ``disk``: uniform over ρ ≤ 1.5;
-* ``box``: uniform over |Δu| ≤ 1.5 σ_u, |Δv| ≤ 1.5 σ_v, with σ_u, σ_v the standard deviations along the axes.
+* ``box``: uniform over |Δu| ≤ 1.5 σ_u, |Δv| ≤ 1.5 σ_v, with σ_u, σ_v the standard deviations along
+  the axes.
 
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
@@ -25,20 +27,20 @@ KERNELS = ("gaussian", "disk", "box")
 #: Reach of each kernel in standard deviations.
 REACH = {"gaussian": 3.0, "disk": 1.5, "box": 1.5}
 
-#: Standard deviation (texels) of the isotropic Gaussian added to every footprint, so that a footprint of no
-#: extent still has a density: the "finest answer". A footprint of half a texel widens by 0.01 %.
+#: Standard deviation (texels) of the isotropic Gaussian added to every footprint, so that one of no
+#: extent still has a density, the "finest answer". A footprint of half a texel widens by 0.01 %.
 SIGMA_MIN = 1 / 128
 
-#: Largest standard deviation (maps) of a footprint. The periodic sum of a Gaussian one map wide is uniform to
-#: 5e-9 (Poisson summation), 2e-3 with its cut at ρ = 3; a wider one only costs more.
+#: Largest standard deviation (maps) of a footprint. Repeated over the map, a Gaussian one map wide
+#: is uniform to 5e-9 (Poisson summation), 2e-3 with its cut at ρ = 3; a wider one only costs more.
 SIGMA_MAX = 1.0
 
 
 def limit_extent(du, dv):
-    """Limit the standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX` along its principal axes.
+    """Limit the principal standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX`.
 
-    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns the two limited vectors. Works on the factor, never on Σ⁻¹, so
-    that a footprint 1000 times longer than wide keeps its width.
+    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns the two limited vectors. Works on the factor,
+    never on Σ⁻¹, so that a footprint 1000 times longer than wide keeps its width.
     """
     a = dr.fma(du.x, du.x, dv.x * dv.x)
     c = dr.fma(du.y, du.y, dv.y * dv.y)
@@ -50,7 +52,8 @@ def limit_extent(du, dv):
         difference >= 0, mi.Vector2f(difference + radius, b), mi.Vector2f(b, radius - difference)
     )
     length = dr.norm(major)
-    major = dr.select(length > 0, major / dr.maximum(length, dr.smallest(mi.Float)), mi.Vector2f(1, 0))
+    found = length > 0
+    major = dr.select(found, major / dr.select(found, length, 1), mi.Vector2f(1, 0))
     minor = mi.Vector2f(-major.y, major.x)
 
     def shorten(variance):
@@ -59,13 +62,14 @@ def limit_extent(du, dv):
     shorten_major, shorten_minor = shorten(mean + radius), shorten(mean - radius)
 
     def limited(d):
-        return d - shorten_major * dr.dot(major, d) * major - shorten_minor * dr.dot(minor, d) * minor
+        along_major, along_minor = dr.dot(major, d), dr.dot(minor, d)
+        return d - shorten_major * along_major * major - shorten_minor * along_minor * minor
 
     return limited(du), limited(dv)
 
 
 def difference_of_products(a, b, c, d):
-    """a b − c d without cancellation (Kahan, with one fused multiply-add for the rounding error)."""
+    """a b − c d without cancellation (Kahan: a fused multiply-add recovers the rounding error)."""
     cd = c * d
     return dr.fma(a, b, -cd) + dr.fma(-c, d, cd)
 
@@ -73,12 +77,13 @@ def difference_of_products(a, b, c, d):
 class TexelKernel:
     """The kernel of one footprint per lane, over a map of ``width`` × ``height`` texels.
 
-    Σ is factored row first: with σ_v the standard deviation over rows, ``shear`` = Σ_uv/Σ_vv and σ_{u|v} the
-    standard deviation of u given v,
+    Σ is factored row first: with σ_v the standard deviation over rows, ``shear`` = Σ_uv/Σ_vv and
+    σ_{u|v} the standard deviation of u given v,
 
         ρ² = (Δv/σ_v)² + ((Δu − shear Δv)/σ_{u|v})².
 
-    The determinant comes from the factor's cross product, so rank-one and 1000:1 footprints keep their digits.
+    The determinant comes from the factor's cross product, so rank-one and 1000:1 footprints keep
+    their digits.
 
     Attributes:
         mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
@@ -91,7 +96,7 @@ class TexelKernel:
         self.kernel = kernel
         uv = footprint.uv
         if wrap_mode == "clamp":
-            # The strips beyond the edges are constant: a footprint six maps outside sees what is there for ever.
+            # The strips beyond the edges are constant: six maps outside looks like any further.
             uv = dr.clip(uv, -6.0, 7.0)
         else:
             period = 2 if wrap_mode == "mirror" else 1
@@ -116,7 +121,8 @@ class TexelKernel:
         if kernel == "box":
             self.peak = dr.rcp(4 * self.reach_u * self.reach_v)
         else:
-            self.inverse_u_given_v, self.inverse_v = dr.rcp(self.sigma_u_given_v), dr.rcp(self.sigma_v)
+            self.inverse_u_given_v = dr.rcp(self.sigma_u_given_v)
+            self.inverse_v = dr.rcp(self.sigma_v)
             mass = 2 * pi * (1 - exp(-0.5 * reach**2)) if kernel == "gaussian" else pi * reach**2
             self.peak = self.inverse_u_given_v * self.inverse_v / mass
             # Row at which the ellipse reaches furthest to the right.
@@ -155,9 +161,9 @@ class TexelKernel:
         return dr.fma(2, self.reach_u, 1) * dr.fma(2, self.reach_v, 1)
 
     def row_extent(self, top, bottom):
-        """Extent (left, right) in texels, relative to the mean, of the support within rows [top, bottom].
+        """Extent (left, right) of the support within the rows [``top``, ``bottom``].
 
-        ``top``, ``bottom``: relative to the mean too. Exact for the ellipse and for the box.
+        All in texels from the mean. Exact for the ellipse and for the box.
         """
         if self.kernel == "box":
             return -self.reach_u, self.reach_u

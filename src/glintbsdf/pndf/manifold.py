@@ -71,8 +71,8 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
 
     The triangles (n0, n1, n2) and (n3, n2, n1) share the diagonal e = n2 − n1, so barycentric
     coordinates are taken from n1: m − n1 = λ0 (n0 − n1) + λ2 e in the one, λ3 (n3 − n1) + λ2' e in
-    the other. A point lies in both only where the mesh folds over between them, which is rare
-    enough for the second kernel value to stand in a branch; so do degenerate triangles.
+    the other. What few quads need stands in branches: a hit at all, a hit of both triangles, which
+    takes a mesh that folds over between them, and degenerate triangles.
 
     Args:
         m (mi.Vector2f): projected normal.
@@ -95,41 +95,39 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
     in_lower = (l3 >= 0) & (l2 >= 0) & (l3 + l2 <= 1) & ~tiny_lower
     u_lower = corner + mi.Vector2f(1 - l2, l2 + l3)
 
-    in_any = in_upper | in_lower
-    # Lanes outside must stay finite: 0 · ∞ would be NaN in the derivatives.
-    u = dr.select(in_upper, u_upper, dr.select(in_lower, u_lower, corner))
-    inverse = dr.select(in_upper, inverse_upper, dr.select(in_lower, inverse_lower, 0))
-    density = dr.select(in_any, kernel.value(u) * dr.abs(inverse), 0)
+    def weighed(inside, u, inverse):
+        # Lanes outside must stay finite: 0 · ∞ would be NaN in the derivatives.
+        u, inverse = dr.select(inside, u, corner), dr.select(inside, inverse, 0)
+        return kernel.value(u) * dr.abs(inverse)
 
-    def add_fold(density):
-        u = dr.select(in_lower, u_lower, corner)
-        return (density + kernel.value(u) * dr.abs(dr.select(in_lower, inverse_lower, 0)),)
+    def hit():
+        density = weighed(
+            in_upper | in_lower,
+            dr.select(in_upper, u_upper, u_lower),
+            dr.select(in_upper, inverse_upper, inverse_lower),
+        )
+        return branch(
+            density, in_upper & in_lower, lambda: weighed(in_lower, u_lower, inverse_lower)
+        )
 
-    (density,) = dr.if_stmt(
-        (density,), active & in_upper & in_lower, add_fold, lambda density: (density,), label="fold"
-    )
+    def branch(density, condition, added):
+        """``density + added()`` where the condition holds; skipped where it holds in no lane."""
+        return dr.if_stmt(
+            (density,), active & condition, lambda d: d + added(), lambda d: d
+        )
 
-    def add_degenerate(density):
+    density = branch(mi.Float(0), in_upper | in_lower, hit)
+
+    def degenerate():
         a, e1, e2 = equilateral(epsilon)
         p = m - 0.5 * (n1 + n2) - mi.Vector2f(*a)
         l1, l2 = (p.x * e2[1] - p.y * e2[0]) / epsilon, (e1[0] * p.y - e1[1] * p.x) / epsilon
         inside = (l1 >= 0) & (l2 >= 0) & (l1 + l2 <= 1)
         upper = kernel.value(corner + mi.Vector2f(l1, l2)) / epsilon
         lower = kernel.value(corner + mi.Vector2f(1 - l1, 1 - l2)) / epsilon
-        return (
-            density
-            + dr.select(inside & tiny_upper, upper, 0)
-            + dr.select(inside & tiny_lower, lower, 0),
-        )
+        return dr.select(inside & tiny_upper, upper, 0) + dr.select(inside & tiny_lower, lower, 0)
 
-    (density,) = dr.if_stmt(
-        (density,),
-        active & (tiny_upper | tiny_lower),
-        add_degenerate,
-        lambda density: (density,),
-        label="degenerate",
-    )
-    return density
+    return branch(density, tiny_upper | tiny_lower, degenerate)
 
 
 class Manifold:

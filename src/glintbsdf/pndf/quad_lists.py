@@ -40,28 +40,28 @@ STRIP_COUNTERS = 1 << 23
 
 
 def every_quad(lattice: Lattice, kernel, add, active):
-    """Sum over all quads that the kernel's bounding box touches, row by row; see ``QuadLists.visit``.
+    """Sum over all quads that the kernel's bounding box touches; see :meth:`QuadLists.visit`.
 
     The right loop for footprints of a few texels, where searching costs more than it saves.
     """
     mean = mi.Vector2f(kernel.mean)
-    left = floor_int(mean.x - kernel.reach_u)
-    right = floor_int(mean.x + kernel.reach_u)
-    bottom = floor_int(mean.y + kernel.reach_v)
+    left, top = floor_int(mean.x - kernel.reach_u), floor_int(mean.y - kernel.reach_v)
+    right, bottom = floor_int(mean.x + kernel.reach_u), floor_int(mean.y + kernel.reach_v)
+    first_column, first_row = lattice.x.locate(left)[1], lattice.y.locate(top)[1]
 
-    def body(x, y, active, density):
-        corner = mi.Vector2f(x, y) - mean
-        density = add(density, lattice.y.locate(y)[1], lattice.x.locate(x)[1], corner, active)
-        x = x + 1
-        new_row = x > right
-        y = dr.select(new_row, y + 1, y)
-        return dr.select(new_row, left, x), y, active & (y <= bottom), density
+    def body(x, y, column, row, active, density):
+        density = add(density, row, column, mi.Vector2f(x, y) - mean, active)
+        new_row = x == right
+        row = dr.select(new_row, lattice.y.following(y, row), row)
+        column = dr.select(new_row, first_column, lattice.x.following(x, column))
+        x, y = dr.select(new_row, left, x + 1), dr.select(new_row, y + 1, y)
+        return x, y, column, row, active & (y <= bottom), density
 
-    y = floor_int(mean.y - kernel.reach_v)
-    state = (mi.Int(left), y, mi.Bool(active), mi.Float(0))
+    state = (mi.Int(left), mi.Int(top), mi.Int(first_column), first_row, mi.Bool(active),
+             mi.Float(0))
     return dr.while_loop(
-        state, lambda x, y, active, density: active, body, max_iterations=-1, label="every quad"
-    )[3]
+        state, lambda *state: state[4], body, max_iterations=-1, label="every quad"
+    )[5]
 
 
 class Packed:
@@ -152,7 +152,7 @@ class NormalCells:
 
 
 class QuadLists:
-    """The lists. Build the arrays with :meth:`build`, wherever they are kept, then make one of these.
+    """The lists, around the arrays that :meth:`build` makes, wherever those were kept since.
 
     Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
         ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
@@ -178,7 +178,7 @@ class QuadLists:
     def visit(self, m, kernel, add, active) -> mi.Float:
         """Sum over all quads that may show ``m`` under the kernel.
 
-        Calls ``add(density, row, column, corner, active)`` for quads (row, column) of the lattice,
+        Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice,
         ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
         it returns the new ``density``. One flat loop, because lanes that walk nested loops wait for
         each other at the end of every inner one. Sums are differentiable in both modes.
@@ -345,8 +345,8 @@ class _Builder:
     def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
         """Scan the rows of blocks of a strip.
 
-        ``counters`` (rows, cells, columns + 1) count the quads per list and block; with ``entries``,
-        they say where the next entry goes, and the entries are returned instead.
+        ``counters`` (rows, cells, columns + 1) count the quads per list and block. With
+        ``entries``, their number, they say where the next one goes, and the entries are returned.
         """
         shape = counters.shape
         block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
