@@ -66,6 +66,18 @@ def effective_triangle(a, b, c, centre, epsilon):
 # ------------------------------------------------------------------------------------------------
 
 
+def add_where(density, condition, added, active):
+    """``density + added()`` where the condition holds, in a branch that is skipped if it never does.
+
+    Not with derivatives: Dr.Jit (1.5) cannot record them through a branch nested in a loop.
+    """
+    if dr.grad_enabled(added()):
+        return density + dr.select(condition, added(), 0)
+    return dr.if_stmt(
+        (density,), active & condition, lambda density: density + added(), lambda density: density
+    )
+
+
 def quad_density(m, corner, kernel, normals, epsilon, active):
     """What one quad adds to D(m) (Eq. 5): k(u* − x) / |det J| for each triangle that contains m.
 
@@ -106,17 +118,11 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
             dr.select(in_upper, u_upper, u_lower),
             dr.select(in_upper, inverse_upper, inverse_lower),
         )
-        return branch(
-            density, in_upper & in_lower, lambda: weighed(in_lower, u_lower, inverse_lower)
+        return add_where(
+            density, in_upper & in_lower, lambda: weighed(in_lower, u_lower, inverse_lower), active
         )
 
-    def branch(density, condition, added):
-        """``density + added()`` where the condition holds; skipped where it holds in no lane."""
-        return dr.if_stmt(
-            (density,), active & condition, lambda d: d + added(), lambda d: d
-        )
-
-    density = branch(mi.Float(0), in_upper | in_lower, hit)
+    density = add_where(mi.Float(0), in_upper | in_lower, hit, active)
 
     def degenerate():
         a, e1, e2 = equilateral(epsilon)
@@ -127,7 +133,7 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
         lower = kernel.value(corner + mi.Vector2f(1 - l1, 1 - l2)) / epsilon
         return dr.select(inside & tiny_upper, upper, 0) + dr.select(inside & tiny_lower, lower, 0)
 
-    return branch(density, tiny_upper | tiny_lower, degenerate)
+    return add_where(density, tiny_upper | tiny_lower, degenerate, active)
 
 
 class Manifold:

@@ -25,7 +25,7 @@ RESOLUTION = 1024
 DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
 
 #: Memory allowed, bytes per quad, the vertices not counted.
-BYTES_PER_QUAD = 48
+BYTES_PER_QUAD = 42
 
 #: Half width (in units of projected normals) by which bounds are widened against rounding.
 MARGIN = 1e-6
@@ -152,7 +152,7 @@ class NormalCells:
 
 
 class QuadLists:
-    """The lists, around the arrays that :meth:`build` makes, wherever those were kept since.
+    """The lists, of the arrays that :meth:`build` makes, wherever those were kept since.
 
     Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
         ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
@@ -167,9 +167,10 @@ class QuadLists:
         self.cells = NormalCells(
             arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
         )
-        self.entries, self.offset = Packed(arrays["entries"]), Packed(arrays["offset"])
-        self.start = mi.UInt32(arrays["start"])
-        self.nbytes = self.entries.nbytes + self.offset.nbytes + arrays["start"].nbytes
+        # Taken out one by one: of a large map, no more than one need exist twice.
+        self.entries, self.offset = Packed(arrays.pop("entries")), Packed(arrays.pop("offset"))
+        self.start = mi.UInt32(arrays.pop("start"))
+        self.nbytes = self.entries.nbytes + self.offset.nbytes + 4 * dr.width(self.start)
 
     def covers(self, m):
         """Whether any quad may show the normal ``m``."""
