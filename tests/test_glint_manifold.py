@@ -153,10 +153,16 @@ def test_masking_is_part_of_the_value(variant):
     assert dr.any(separable < 0.9999 * correlated, axis=None)
 
 
-@pytest.mark.parametrize("key", ["specular_reflectance.value", "eta.value", "k.value"])
+@pytest.mark.parametrize("key", ["data", "footprint_sigma", "specular_reflectance.value",
+                                 "eta.value", "k.value"])
 def test_derivatives(variant, key):
     bsdf = load(MAPS["isotropic"], masking="beckmann", eta=0.5, k=2.0, specular_reflectance=0.5)
     suite.check_derivative(bsdf, RESOLVED, key)
+
+
+def test_derivative_of_the_cone(variant):
+    bsdf = load(MAPS["isotropic"], pixel_spread=0.05)
+    suite.check_derivative(bsdf, View(wi=(0.3, 0.1, 1)), "pixel_spread")
 
 
 def test_albedo(variant):
