@@ -153,7 +153,7 @@ import mitsuba as mi
 from glintbsdf.bsdf import GlintBSDF
 from glintbsdf.errors import check
 from glintbsdf.kernels import KERNELS
-from glintbsdf.microfacet import BeckmannMasking
+from glintbsdf.microfacet import MapBeckmannMasking
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import Manifold
 
@@ -177,7 +177,7 @@ class GlintManifold(GlintBSDF):
         height_correlated = parameters.boolean("height_correlated", True)
         self.masking = None
         if masking == "beckmann":
-            self.masking = BeckmannMasking(self.pndf, height_correlated)
+            self.masking = MapBeckmannMasking(self.pndf, height_correlated)
 
 
 mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))

@@ -23,9 +23,12 @@ class GlintBSDF(mi.BSDF):
 
     Attributes:
         pndf: the P-NDF: ``eval(m, footprint, active)``, the density D over the disk of projected
-            normals, and ``sample(footprint, sample1, sample2, active)``, which draws from exactly
-            that density; ``traverse`` and ``parameters_changed``.
+            normals; ``traverse`` and ``parameters_changed``.
         masking: :class:`~glintbsdf.microfacet.SmithMasking`, or None for none.
+
+    Normals are drawn by the P-NDF's ``sample(footprint, sample1, sample2, active)``, from exactly
+    its density. A subclass whose P-NDF cannot do that overrides :meth:`normals`; one whose density
+    has colours overrides :meth:`density`.
 
     Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
     """
@@ -73,24 +76,25 @@ class GlintBSDF(mi.BSDF):
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
             return bs, mi.Spectrum(0)
 
-        # Draw a projected normal and reflect about it. One that lies outside the disk, or reflects
-        # below the horizon, is an invalid sample: its mass is missing from the pdf as well.
+        # Draw a normal and reflect about it. One that does not point up, or reflects below the
+        # horizon, is an invalid sample: its mass is missing from the pdf as well.
         footprint = self.footprint(si)
-        s = self.pndf.sample(footprint, sample1, sample2, active)
-        m = microfacet.normal_from_projection(s)
+        normals = self.normals()
+        m = normals.sample(si.wi, footprint, sample1, sample2, active)
         wo = mi.reflect(si.wi, mi.Normal3f(m))
         active &= (m.z > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-        density = self.pndf.eval(s, footprint, active)
-        active &= density > 0
+        density = self.density(si, m, footprint, active)
+        pdf = normals.pdf(si.wi, m, density, footprint, active)
+        active &= pdf > 0
 
         bs.wo = wo
-        bs.pdf = dr.select(active, microfacet.reflected_pdf(density, wo, m), 0)
+        bs.pdf = dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0)
         bs.eta = 1
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         bs.sampled_component = 0
 
-        # D drops out of eval/pdf.
-        weight = dr.dot(wo, m) / dr.select(active, cos_theta_i * m.z, 1)
+        value = microfacet.reflected_value(density, dr.select(active, cos_theta_i, 1))
+        weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
         return bs, self.reflected(weight, ctx, si, si.wi, wo, m, footprint, active)
 
     def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
@@ -115,10 +119,11 @@ class GlintBSDF(mi.BSDF):
         wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
         m = microfacet.half_vector(wi, wo)
         footprint = self.footprint(si)
-        density = self.pndf.eval(mi.Vector2f(m.x, m.y), footprint, active)
+        density = self.density(si, m, footprint, active)
         value = microfacet.reflected_value(density, wi.z)
+        pdf = self.normals().pdf(wi, m, density, footprint, active)
         return (self.reflected(value, ctx, si, wi, wo, m, footprint, active),
-                dr.select(active, microfacet.reflected_pdf(density, wo, m), 0))
+                dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0))
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f,
                                  active: mi.Bool = True) -> mi.Spectrum:
@@ -135,6 +140,15 @@ class GlintBSDF(mi.BSDF):
             albedo = albedo * self.fresnel.reflectance(cos_theta_i, si, active)
         albedo = dr.select(active, albedo, 0)
         return mi.mueller.depolarizer(albedo) if mi.is_polarized else albedo
+
+    def density(self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint,
+                active: mi.Bool) -> mi.Float | mi.UnpolarizedSpectrum:
+        """D of the unit normal ``m``: one number, or one per channel for a P-NDF with colours."""
+        return self.pndf.eval(mi.Vector2f(m.x, m.y), footprint, active)
+
+    def normals(self) -> microfacet.PndfNormals:
+        """What normals are drawn from: an object with the methods of ``PndfNormals``."""
+        return microfacet.PndfNormals(self.pndf)
 
     def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
         """The footprint at ``si`` in the UV space of the map."""
@@ -159,16 +173,16 @@ class GlintBSDF(mi.BSDF):
             return mi.UnpolarizedSpectrum(1)
         return self.specular_reflectance.eval(si, active)
 
-    def reflected(self, value: mi.Float, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f,
-                  wi: mi.Vector3f, wo: mi.Vector3f, m: mi.Vector3f, footprint: Footprint,
-                  active: mi.Bool) -> mi.Spectrum:
+    def reflected(self, value: mi.Float | mi.UnpolarizedSpectrum, ctx: mi.BSDFContext,
+                  si: mi.SurfaceInteraction3f, wi: mi.Vector3f, wo: mi.Vector3f, m: mi.Vector3f,
+                  footprint: Footprint, active: mi.Bool) -> mi.Spectrum:
         """``value`` times masking, tint and Fresnel reflectance or Mueller matrix, where active."""
         if self.masking is not None:
             value = value * self.masking.eval(wi, wo, footprint, active)
         tint = self.tint(si, active)
         if mi.is_polarized:
-            spectrum = value * microfacet.mueller_reflection(
-                self.fresnel.index(si, active), tint, ctx.mode, wi, wo, m)
+            spectrum = microfacet.mueller_reflection(
+                self.fresnel.index(si, active), value * tint, ctx.mode, wi, wo, m)
         else:
             spectrum = value * tint
             if self.fresnel is not None:

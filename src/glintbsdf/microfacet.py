@@ -38,18 +38,40 @@ def normal_from_projection(s: mi.Vector2f) -> mi.Vector3f:
     return mi.Vector3f(s.x, s.y, dr.safe_sqrt(1 - dr.squared_norm(s)))
 
 
-def reflected_value(density: mi.Float, cos_theta_i: mi.Float) -> mi.Float:
+def reflected_value(
+    density: mi.Float | mi.UnpolarizedSpectrum, cos_theta_i: mi.Float
+) -> mi.Float | mi.UnpolarizedSpectrum:
     """``f_r cosθ_o`` of a perfect mirror without masking: ``D / (4 cosθ_i)``, 1/steradian."""
     return density / (4 * cos_theta_i)
 
 
-def reflected_pdf(density: mi.Float, wo: mi.Vector3f, m: mi.Vector3f) -> mi.Float:
-    """Density of ``wo`` (1/steradian) when the projected normal of ``m`` has density ``D``.
+def reflected_pdf(pdf: mi.Float, wo: mi.Vector3f, m: mi.Vector3f) -> mi.Float:
+    """Density of ``wo`` (1/steradian) when the normal ``m`` is drawn with density ``pdf``.
 
-    ``D cosθ_m`` is the density of ``m`` per solid angle, ``1 / (4 |wo·m|)`` the Jacobian of the
-    half vector.
+    ``1 / (4 |wo·m|)`` is the Jacobian of the half vector.
     """
-    return density * m.z / (4 * dr.abs(dr.dot(wo, m)))
+    return pdf / (4 * dr.abs(dr.dot(wo, m)))
+
+
+class PndfNormals:
+    """Draws normals with exactly the density of a P-NDF; the pattern for other samplers.
+
+    Args:
+        pndf: a P-NDF with ``sample``.
+    """
+
+    def __init__(self, pndf: object) -> None:
+        self.pndf = pndf
+
+    def sample(self, wi: mi.Vector3f, footprint: Footprint, sample1: mi.Float, sample2: mi.Point2f,
+               active: mi.Bool) -> mi.Vector3f:
+        """A unit normal for the view from ``wi``; one with z ≤ 0 is an invalid sample."""
+        return normal_from_projection(self.pndf.sample(footprint, sample1, sample2, active))
+
+    def pdf(self, wi: mi.Vector3f, m: mi.Vector3f, density: mi.Float, footprint: Footprint,
+            active: mi.Bool) -> mi.Float:
+        """Density of ``m`` per solid angle, given ``density``, which is D(m)."""
+        return density * m.z
 
 
 # --------------------------------------------------------------------------------------------------
@@ -178,26 +200,16 @@ class SmithMasking:
 
 
 class BeckmannMasking(SmithMasking):
-    """Masking of a Beckmann surface as rough as the whole map.
+    """Masking of a Beckmann surface.
 
     Args:
-        pndf: the P-NDF whose map ``pndf.data`` (H×W×2 projected normals) gives the roughness.
+        alpha_squared: ``mi.Vector2f``, squared roughness along u and v.
         height_correlated: see :class:`SmithMasking`.
-
-    Attributes:
-        alpha_squared: ``mi.Vector2f``, squared roughness along u and v: twice the mean squared
-            slope ``n_xy / n_z`` of the map. Derivatives flow through it to the map.
     """
 
-    def __init__(self, pndf: object, height_correlated: bool = True) -> None:
+    def __init__(self, alpha_squared: mi.Vector2f, height_correlated: bool = True) -> None:
         super().__init__(height_correlated)
-        self.pndf = pndf
-        self.parameters_changed()
-
-    def parameters_changed(self) -> None:
-        s = dr.unravel(mi.Vector2f, self.pndf.data.array)
-        z_squared = 1 - dr.squared_norm(s)
-        self.alpha_squared = mi.Vector2f([2 * dr.mean(x * x / z_squared) for x in s])
+        self.alpha_squared = alpha_squared
 
     def smith_lambda(self, w: mi.Vector3f, footprint: Footprint, active: mi.Bool) -> mi.Float:
         return beckmann_lambda(w, self.alpha_squared)
@@ -206,6 +218,32 @@ class BeckmannMasking(SmithMasking):
         alpha_u, alpha_v = (sqrt(x[0]) for x in self.alpha_squared)
         return (f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
                 f"height_correlated = {self.height_correlated}]")
+
+
+class MapBeckmannMasking(BeckmannMasking):
+    """Masking of a Beckmann surface as rough as the whole map.
+
+    The squared roughness is twice the mean squared slope ``n_xy / n_z`` of the map, and derivatives
+    flow through it to the map.
+
+    Args:
+        pndf: the P-NDF whose map ``pndf.data`` (H×W×2 projected normals) gives the roughness.
+        height_correlated: see :class:`SmithMasking`.
+    """
+
+    def __init__(self, pndf: object, height_correlated: bool = True) -> None:
+        super().__init__(map_alpha_squared(pndf.data), height_correlated)
+        self.pndf = pndf
+
+    def parameters_changed(self) -> None:
+        self.alpha_squared = map_alpha_squared(self.pndf.data)
+
+
+def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
+    """Squared Beckmann roughness of a map of projected normals (H×W×2) along u and v."""
+    s = dr.unravel(mi.Vector2f, data.array)
+    z_squared = 1 - dr.squared_norm(s)
+    return mi.Vector2f([2 * dr.mean(x * x / z_squared) for x in s])
 
 
 def beckmann_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:
