@@ -47,7 +47,8 @@ class FirstVersion:
         next_i, next_j = (i + 1) & (self.height - 1), (j + 1) & (self.width - 1)
         n0, n1, n2, n3 = (
             dr.gather(mi.Vector2f, self.vertices, mi.UInt32(row * self.width + column), active)
-            for row in (i, next_i) for column in (j, next_j)
+            for row in (i, next_i)
+            for column in (j, next_j)
         )
 
         def kernel(offset):
@@ -56,10 +57,10 @@ class FirstVersion:
             return dr.select(rho2 <= 9, peak * dr.exp(-0.5 * rho2), 0)
 
         centre = 0.5 * (n1 + n2)
-        return (
-            triangle_density(m, n0, n1, n2, centre, lambda l1, l2: kernel(mi.Vector2f(l1, l2)))
-            + triangle_density(
-                m, n3, n2, n1, centre, lambda l1, l2: kernel(mi.Vector2f(1 - l1, 1 - l2)))
+        return triangle_density(
+            m, n0, n1, n2, centre, lambda l1, l2: kernel(mi.Vector2f(l1, l2))
+        ) + triangle_density(
+            m, n3, n2, n1, centre, lambda l1, l2: kernel(mi.Vector2f(1 - l1, 1 - l2))
         )
 
     def texels(self, uv):
@@ -107,11 +108,13 @@ class FirstLists(FirstVersion):
         count = extent.prod(1)
         quad = np.repeat(np.arange(len(count), dtype=np.int32), count)
         k = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        cells = ((first[quad, 1] + k // extent[quad, 0]) * self.CELLS
-                 + first[quad, 0] + k % extent[quad, 0])
+        cells = (
+            (first[quad, 1] + k // extent[quad, 0]) * self.CELLS
+            + first[quad, 0]
+            + k % extent[quad, 0]
+        )
         self.blocks_x, self.blocks_y = self.width // self.BLOCK, self.height // self.BLOCK
-        block = ((quad // self.width // self.BLOCK) * self.blocks_x
-                 + quad % self.width // self.BLOCK)
+        block = (quad // self.width // self.BLOCK) * self.blocks_x + quad % self.width // self.BLOCK
         blocks = self.blocks_x * self.blocks_y
         key = cells.astype(np.int64) * blocks + block
         self.entries = mi.UInt32(quad[np.argsort(key, kind="stable")])
@@ -153,6 +156,13 @@ class FirstLists(FirstVersion):
             return entry + 1, end, block_x, block_y, origin, active, density
 
         zero = dr.zeros(mi.Int, dr.width(uv))
-        state = (mi.UInt32(zero), mi.UInt32(zero), last.x + 1, first.y - 1, zero + 0, active,
-                 mi.Float(zero))
+        state = (
+            mi.UInt32(zero),
+            mi.UInt32(zero),
+            last.x + 1,
+            first.y - 1,
+            zero + 0,
+            active,
+            mi.Float(zero),
+        )
         return dr.while_loop(state, lambda *state: state[5], body)[6]

@@ -77,7 +77,8 @@ def measure(versions, normal_map, radius, count, coherent, repetitions):
     sigma_uv = sigma / normal_map.width
     calls = {
         "lists": lambda: versions["lists"].eval(
-            m, Footprint(uv, mi.Vector2f(sigma_uv, 0), mi.Vector2f(0, sigma_uv))),
+            m, Footprint(uv, mi.Vector2f(sigma_uv, 0), mi.Vector2f(0, sigma_uv))
+        ),
         "first lists": lambda: versions["first lists"].eval(m, uv, sigma),
     }
     if radius <= 32:  # beyond, it takes minutes
@@ -96,8 +97,7 @@ def measure(versions, normal_map, radius, count, coherent, repetitions):
     for name in calls:
         result[f"{name} Mq/s"] = dr.width(uv) / float(np.median(times[name])) / 1e6
         if name != "lists":
-            result[f"ratio to {name}"] = float(
-                np.median(np.divide(times[name], times["lists"])))
+            result[f"ratio to {name}"] = float(np.median(np.divide(times[name], times["lists"])))
     return result
 
 
@@ -129,21 +129,29 @@ def main() -> None:
             row = measure(versions, normal_map, radius, count, coherent, options.repetitions)
             results.append(row)
             plain = row.get("ratio to plain loop")
-            print(f"{radius:6} {'coherent' if coherent else 'random  '} {row['lists Mq/s']:9.4f}"
-                  f" {row['ratio to first lists']:12.2f}"
-                  f" {'–' if plain is None else f'{plain:.2f}':>15} {row['relative_l1']:15.1e}")
+            print(
+                f"{radius:6} {'coherent' if coherent else 'random  '} {row['lists Mq/s']:9.4f}"
+                f" {row['ratio to first lists']:12.2f}"
+                f" {'–' if plain is None else f'{plain:.2f}':>15} {row['relative_l1']:15.1e}"
+            )
     if options.output:
-        options.output.write_text(json.dumps({
-            "machine": platform.processor() or platform.machine(),
-            "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
-            "llvm": list(dr.detail.llvm_version()),
-            "map": options.map or "isotropic",
-            "build_seconds": build,
-            "bytes": manifold.nbytes,
-            "bytes_first_lists": versions["first lists"].nbytes,
-            "results": results,
-        }, indent=1) + "\n")
+        options.output.write_text(
+            json.dumps(
+                {
+                    "machine": platform.processor() or platform.machine(),
+                    "mitsuba": mi.__version__,
+                    "drjit": dr.__version__,
+                    "llvm": list(dr.detail.llvm_version()),
+                    "map": options.map or "isotropic",
+                    "build_seconds": build,
+                    "bytes": manifold.nbytes,
+                    "bytes_first_lists": versions["first lists"].nbytes,
+                    "results": results,
+                },
+                indent=1,
+            )
+            + "\n"
+        )
 
 
 if __name__ == "__main__":

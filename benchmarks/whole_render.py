@@ -22,11 +22,11 @@ os.environ["GLINTBSDF_CACHE"] = "off"  # building is timed
 _kernels = tempfile.TemporaryDirectory()
 os.environ["DRJIT_CACHE_DIR"] = _kernels.name  # and so is compiling
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
+import drjit as dr  # noqa: E402  (the environment comes first)
+import mitsuba as mi  # noqa: E402
+import numpy as np  # noqa: E402
 
-import glintbsdf  # noqa: F401  (registers the plugins)
+import glintbsdf  # noqa: E402, F401  (registers the plugins)
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -47,8 +47,10 @@ def smooth(size: int, spp: int) -> mi.Scene:
     """The scene with a ``roughconductor`` as rough as the map."""
     text = SCENE.read_text()
     start, end = text.index('<bsdf type="glint_manifold">'), text.index("</bsdf>")
-    text = (text[:start] + '<bsdf type="roughconductor"><string name="material" value="Cr"/>'
-            '<float name="alpha" value="0.15"/>' + text[end:])
+    text = (
+        text[:start] + '<bsdf type="roughconductor"><string name="material" value="Cr"/>'
+        '<float name="alpha" value="0.15"/>' + text[end:]
+    )
     mi.file_resolver().append(str(SCENE.parent))
     used = {"spp": str(spp), "resx": str(size), "resy": str(size)}
     return mi.load_string(text, **used)
@@ -62,8 +64,14 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write")
-    parser.add_argument("-D", dest="define", metavar="KEY=VALUE", action="append", default=[],
-                        help="parameter of the scene, as for glintbsdf render")
+    parser.add_argument(
+        "-D",
+        dest="define",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="parameter of the scene, as for glintbsdf render",
+    )
     options = parser.parse_args()
 
     defines = dict(item.split("=", 1) for item in options.define)
@@ -81,23 +89,46 @@ def main() -> None:
         scene = load_scene(SCENE, {**defines, "pixel_spread": str(pixels * angle)})
         loading = time.perf_counter() - start
         first_frame = seconds(scene, options.spp, 0)
-        times = np.array([
-            [seconds(s, options.spp, seed) for s in (rough, scene)]
-            for seed in range(1, options.repetitions + 1)
-        ])
+        times = np.array(
+            [
+                [seconds(s, options.spp, seed) for s in (rough, scene)]
+                for seed in range(1, options.repetitions + 1)
+            ]
+        )
         ratio = float(np.median(times[:, 1] / times[:, 0]))
         medians = np.median(times, axis=0)
-        print(f"footprint {pixels:7.4f} pixels: {ratio:5.2f} × roughconductor "
-              f"({medians[1]:.2f} s, {medians[0]:.2f} s); loading and building {loading:.2f} s, "
-              f"first frame {first_frame:.2f} s", flush=True)
-        results.append({"pixels": pixels, "ratio": ratio, "seconds": medians[1],
-                        "seconds_roughconductor": medians[0], "seconds_loading": loading,
-                        "seconds_first_frame": first_frame})
+        print(
+            f"footprint {pixels:7.4f} pixels: {ratio:5.2f} × roughconductor "
+            f"({medians[1]:.2f} s, {medians[0]:.2f} s); loading and building {loading:.2f} s, "
+            f"first frame {first_frame:.2f} s",
+            flush=True,
+        )
+        results.append(
+            {
+                "pixels": pixels,
+                "ratio": ratio,
+                "seconds": medians[1],
+                "seconds_roughconductor": medians[0],
+                "seconds_loading": loading,
+                "seconds_first_frame": first_frame,
+            }
+        )
     if options.output:
-        options.output.write_text(json.dumps(
-            {"mitsuba": mi.__version__, "drjit": dr.__version__,
-             "llvm": list(dr.detail.llvm_version()), "threads": dr.thread_count(),
-             "size": options.size, "spp": options.spp, "results": results}, indent=1) + "\n")
+        options.output.write_text(
+            json.dumps(
+                {
+                    "mitsuba": mi.__version__,
+                    "drjit": dr.__version__,
+                    "llvm": list(dr.detail.llvm_version()),
+                    "threads": dr.thread_count(),
+                    "size": options.size,
+                    "spp": options.spp,
+                    "results": results,
+                },
+                indent=1,
+            )
+            + "\n"
+        )
 
 
 if __name__ == "__main__":

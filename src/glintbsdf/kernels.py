@@ -90,8 +90,9 @@ class TexelKernel:
         reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
     """
 
-    def __init__(self, kernel: str, footprint: Footprint, height: int, width: int,
-                 wrap_mode: str) -> None:
+    def __init__(
+        self, kernel: str, footprint: Footprint, height: int, width: int, wrap_mode: str
+    ) -> None:
         check_choice("TexelKernel", "kernel", kernel, KERNELS)
         self.kernel = kernel
         uv = footprint.uv

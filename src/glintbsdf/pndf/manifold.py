@@ -154,8 +154,13 @@ class Manifold:
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
 
-    def __init__(self, normal_map: NormalMap, kernel: str = "gaussian", epsilon: float = 1e-6,
-                 owner: str = "Manifold") -> None:
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        kernel: str = "gaussian",
+        epsilon: float = 1e-6,
+        owner: str = "Manifold",
+    ) -> None:
         check_choice(owner, "kernel", kernel, KERNELS)
         check(0 < epsilon < 1, owner, "epsilon", "a number in (0, 1)", epsilon)
         self.normal_map, self.kernel, self.epsilon = normal_map, kernel, float(epsilon)
@@ -174,10 +179,14 @@ class Manifold:
         dr.eval(self.vertices)
         self.lists = QuadLists(
             self.lattice,
-            cached(lambda: QuadLists.build(
-                self.lattice, self.effective_triangles, self.data.numpy().reshape(-1, 2),
-                self.bounds(),
-            )),
+            cached(
+                lambda: QuadLists.build(
+                    self.lattice,
+                    self.effective_triangles,
+                    self.data.numpy().reshape(-1, 2),
+                    self.bounds(),
+                )
+            ),
         )
 
     def quad_normals(self, row, column, active=True):
@@ -220,8 +229,9 @@ class Manifold:
         density = every_quad(self.lattice, kernel, add, active & few)
         return density + self.lists.visit(m, kernel, add, active & ~few)
 
-    def sample(self, footprint, sample1, sample2: mi.Point2f,
-               active: bool | mi.Bool = True) -> mi.Vector2f:
+    def sample(
+        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    ) -> mi.Vector2f:
         """Draw a projected normal with density D (Eq. 6): the normal at a place drawn from k.
 
         One that falls outside the disk is an invalid sample, as D is 0 there. ``sample1`` is not
@@ -237,8 +247,11 @@ class Manifold:
         upper = l1 + l2 < 1
         l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
         a, e1, e2 = effective_triangle(
-            dr.select(upper, n0, n3), dr.select(upper, n1, n2), dr.select(upper, n2, n1),
-            0.5 * (n1 + n2), self.epsilon,
+            dr.select(upper, n0, n3),
+            dr.select(upper, n1, n2),
+            dr.select(upper, n2, n1),
+            0.5 * (n1 + n2),
+            self.epsilon,
         )
         return a + e1 * l1 + e2 * l2
 
@@ -266,5 +279,7 @@ class Manifold:
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape
-        return (f"Manifold[{width}×{height} texels, {self.normal_map.wrap_mode}, "
-                f"kernel={self.kernel}, epsilon={self.epsilon:g}, {self.nbytes / 2**20:.1f} MiB]")
+        return (
+            f"Manifold[{width}×{height} texels, {self.normal_map.wrap_mode}, "
+            f"kernel={self.kernel}, epsilon={self.epsilon:g}, {self.nbytes / 2**20:.1f} MiB]"
+        )

@@ -57,8 +57,14 @@ def every_quad(lattice: Lattice, kernel, add, active):
         x, y = dr.select(new_row, left, x + 1), dr.select(new_row, y + 1, y)
         return x, y, column, row, active & (y <= bottom), density
 
-    state = (mi.Int(left), mi.Int(top), mi.Int(first_column), first_row, mi.Bool(active),
-             mi.Float(0))
+    state = (
+        mi.Int(left),
+        mi.Int(top),
+        mi.Int(first_column),
+        first_row,
+        mi.Bool(active),
+        mi.Float(0),
+    )
     return dr.while_loop(
         state, lambda *state: state[4], body, max_iterations=-1, label="every quad"
     )[5]
@@ -208,7 +214,10 @@ class QuadLists:
             y = dr.select(new_row, next_y, y)
             x, right, next_y, origin_y, row, list_index = dr.if_stmt(
                 (x, right, next_y, origin_y, row, list_index),
-                new_row, next_row, lambda *state: state, label="next row",
+                new_row,
+                next_row,
+                lambda *state: state,
+                label="next row",
             )
             active = active & (y <= bottom)
             origin_x, column, column_end = columns.locate(x)
@@ -391,12 +400,25 @@ class _Builder:
             slab = mi.Int(cells.slab(lowest.x - MARGIN, exists))
             last_slab = dr.select(exists, mi.Int(cells.slab(highest.x + MARGIN, exists)), -1)
             cell, last_cell = cell_range(slab, lowest.y, highest.y, exists)
-            return (quad, slab, last_slab, cell, last_cell, lowest.y, highest.y, first, second,
-                    active)
+            return (
+                quad,
+                slab,
+                last_slab,
+                cell,
+                last_cell,
+                lowest.y,
+                highest.y,
+                first,
+                second,
+                active,
+            )
 
         def body(*state):
             state = dr.if_stmt(
-                state, state[-1] & (state[1] > state[2]), next_quad, lambda *state: state,
+                state,
+                state[-1] & (state[1] > state[2]),
+                next_quad,
+                lambda *state: state,
                 label="next quad",
             )
             quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active = state
@@ -425,8 +447,16 @@ class _Builder:
         none, zero = dr.zeros(mi.Int, n), dr.zeros(mi.Float, n)
         triangle = tuple(dr.zeros(mi.Vector2f, n) for _ in range(3))
         state = (
-            dr.full(mi.UInt32, 0xFFFFFFFF, n), none + 0, none - 1, none + 0, none - 1,
-            zero + 0, zero + 0, triangle, tuple(v + 0 for v in triangle), dr.full(mi.Bool, True, n),
+            dr.full(mi.UInt32, 0xFFFFFFFF, n),
+            none + 0,
+            none - 1,
+            none + 0,
+            none - 1,
+            zero + 0,
+            zero + 0,
+            triangle,
+            tuple(v + 0 for v in triangle),
+            dr.full(mi.Bool, True, n),
         )
         dr.while_loop(state, lambda *state: state[-1], body, label="scan of quads")
         dr.eval(counters, entries)
