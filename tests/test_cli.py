@@ -152,6 +152,7 @@ def test_one_thread_does_not_hang(run, folder):
         (["render", "scene.xml", "-D", "spread=-1"], 1, '"pixel_spread" must be a finite number'),
         (["render", "scene.xml", "-o", "nowhere/out.exr"], 1, "cannot write to nowhere/out.exr"),
         (["render", "no_sensor.xml"], 1, "no sensor"),
+        (["render", "no_uvs.xml"], 1, 'the mesh "bare" has no UV coordinates'),
         (["render", "broken.xml"], 1, "broken.xml"),
         (["nonsense"], 2, "No such command 'nonsense'"),
     ],
@@ -159,6 +160,9 @@ def test_one_thread_does_not_hang(run, folder):
 def test_errors_are_one_line_and_leave_nothing(run, folder, arguments, expected_status, message):
     (folder / "no_sensor.xml").write_text('<scene version="3.0.0"/>')
     (folder / "broken.xml").write_text('<scene version="3.0.0">')
+    bare = '<shape type="obj" id="bare"><string name="filename" value="bare.obj"/>'
+    (folder / "no_uvs.xml").write_text(SCENE.replace('<shape type="rectangle">', bare))
+    (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     before = set(folder.iterdir())
     status, output, errors = run(*arguments)
     assert status == expected_status
