@@ -67,7 +67,7 @@ def effective_triangle(a, b, c, centre, epsilon):
 
 
 def add_where(density, condition, added, active):
-    """``density + added()`` where the condition holds, in a branch that is skipped if it never does.
+    """``density + added()`` where the condition holds, in a branch skipped where it never does.
 
     Not with derivatives: Dr.Jit (1.5) cannot record them through a branch nested in a loop.
     """
@@ -136,8 +136,8 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
     return add_where(density, tiny_upper | tiny_lower, degenerate, active)
 
 
-class Manifold:
-    """Exact P-NDF of a normal map (Eq. 5) and its exact sampler (Eq. 6).
+class TexelMesh:
+    """The position-normal manifold: texels as vertices of triangles, without any search structure.
 
     Belongs to the variant of Mitsuba that is active when it is made.
 
@@ -149,7 +149,7 @@ class Manifold:
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
-            change of its values, :meth:`parameters_changed` rebuilds the lists.
+            change of its values, :meth:`parameters_changed` rebuilds what depends on them.
 
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
@@ -159,35 +159,23 @@ class Manifold:
         normal_map: NormalMap,
         kernel: str = "gaussian",
         epsilon: float = 1e-6,
-        owner: str = "Manifold",
+        owner: str = "TexelMesh",
     ) -> None:
         check_choice(owner, "kernel", kernel, KERNELS)
         check(0 < epsilon < 1, owner, "epsilon", "a number in (0, 1)", epsilon)
         self.normal_map, self.kernel, self.epsilon = normal_map, kernel, float(epsilon)
         self.owner = owner
         self.data = mi.TensorXf(normal_map.normals)
-        key = f"manifold {QuadLists.VERSION} {normal_map.content_hash} {self.epsilon!r}"
-        self.build(lambda build: load_or_build(key, build))
+        self.build()
 
-    def build(self, cached=lambda build: build()) -> None:
-        """Make everything that depends on ``self.data``; ``cached`` may know the lists already."""
+    def build(self) -> None:
+        """Make everything that depends on ``self.data``."""
         height, width, _ = self.data.shape
         self.lattice = Lattice(height, width, self.normal_map.wrap_mode)
         texel = mi.UInt32(self.lattice.source)
         vertices = dr.gather(mi.Vector2f, self.data.array, texel)
         self.vertices = dr.ravel(vertices)
         dr.eval(self.vertices)
-        self.lists = QuadLists(
-            self.lattice,
-            cached(
-                lambda: QuadLists.build(
-                    self.lattice,
-                    self.effective_triangles,
-                    self.data.numpy().reshape(-1, 2),
-                    self.bounds(),
-                )
-            ),
-        )
 
     def quad_normals(self, row, column, active=True):
         """Projected normals n0…n3 of a stored quad (Eq. 3)."""
@@ -206,39 +194,8 @@ class Manifold:
                 effective_triangle(n3, n2, n1, centre, self.epsilon),
             )
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest rectangle (lower, upper) of projected normals that holds all triangles."""
-        normals = self.data.numpy().reshape(-1, 2)
-        reach = equilateral(self.epsilon)[0][1] * 1.001
-        return normals.min(0) - reach, normals.max(0) + reach
-
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """D(m), the density of projected normals over the unit disk (Eq. 5); 0 outside of it.
-
-        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
-        """
-        kernel = self.texel_kernel(footprint)
-        active = mi.Bool(active) & (dr.squared_norm(m) < 1) & self.lists.covers(m)
-        few = kernel.touched_quads() <= FEW_QUADS
-
-        def add(density, row, column, corner, active):
-            normals = self.quad_normals(row, column, active)
-            added = quad_density(m, corner, kernel, normals, self.epsilon, active)
-            return density + dr.select(active, added, 0)
-
-        density = every_quad(self.lattice, kernel, add, active & few)
-        return density + self.lists.visit(m, kernel, add, active & ~few)
-
-    def sample(
-        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
-    ) -> mi.Vector2f:
-        """Draw a projected normal with density D (Eq. 6): the normal at a place drawn from k.
-
-        One that falls outside the disk is an invalid sample, as D is 0 there. ``sample1`` is not
-        needed.
-        """
-        kernel = self.texel_kernel(footprint)
-        u = kernel.mean + kernel.sample(sample2)
+    def normal_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> mi.Vector2f:
+        """The projected normal n(u) of the effective triangles at the position ``u``, in texels."""
         column, row = floor_int(u.x), floor_int(u.y)
         l1, l2 = u.x - column, u.y - row
         n0, n1, n2, n3 = self.quad_normals(
@@ -274,12 +231,85 @@ class Manifold:
 
     @property
     def nbytes(self) -> int:
-        """Memory of vertices and lists, bytes."""
-        return 4 * dr.width(self.vertices) + self.lists.nbytes
+        """Memory of the structure, bytes."""
+        return 4 * dr.width(self.vertices)
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape
         return (
-            f"Manifold[{width}×{height} texels, {self.normal_map.wrap_mode}, "
+            f"{type(self).__name__}[{width}×{height} texels, {self.normal_map.wrap_mode}, "
             f"kernel={self.kernel}, epsilon={self.epsilon:g}, {self.nbytes / 2**20:.1f} MiB]"
         )
+
+
+class Manifold(TexelMesh):
+    """Exact P-NDF of a normal map (Eq. 5) and its exact sampler (Eq. 6).
+
+    Arguments, attributes and errors are those of :class:`TexelMesh`.
+    """
+
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        kernel: str = "gaussian",
+        epsilon: float = 1e-6,
+        owner: str = "Manifold",
+    ) -> None:
+        key = f"manifold {QuadLists.VERSION} {normal_map.content_hash} {epsilon!r}"
+        self.cached = lambda build: load_or_build(key, build)
+        super().__init__(normal_map, kernel, epsilon, owner)
+        self.cached = lambda build: build()  # of data that change, nothing is kept
+
+    def build(self) -> None:
+        """Make everything that depends on ``self.data``; the cache may know the lists already."""
+        super().build()
+        self.lists = QuadLists(
+            self.lattice,
+            self.cached(
+                lambda: QuadLists.build(
+                    self.lattice,
+                    self.effective_triangles,
+                    self.data.numpy().reshape(-1, 2),
+                    self.bounds(),
+                )
+            ),
+        )
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest rectangle (lower, upper) of projected normals that holds all triangles."""
+        normals = self.data.numpy().reshape(-1, 2)
+        reach = equilateral(self.epsilon)[0][1] * 1.001
+        return normals.min(0) - reach, normals.max(0) + reach
+
+    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk (Eq. 5); 0 outside of it.
+
+        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
+        """
+        kernel = self.texel_kernel(footprint)
+        active = mi.Bool(active) & (dr.squared_norm(m) < 1) & self.lists.covers(m)
+        few = kernel.touched_quads() <= FEW_QUADS
+
+        def add(density, row, column, corner, active):
+            normals = self.quad_normals(row, column, active)
+            added = quad_density(m, corner, kernel, normals, self.epsilon, active)
+            return density + dr.select(active, added, 0)
+
+        density = every_quad(self.lattice, kernel, add, active & few)
+        return density + self.lists.visit(m, kernel, add, active & ~few)
+
+    def sample(
+        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    ) -> mi.Vector2f:
+        """Draw a projected normal with density D (Eq. 6): the normal at a place drawn from k.
+
+        One that falls outside the disk is an invalid sample, as D is 0 there. ``sample1`` is not
+        needed.
+        """
+        kernel = self.texel_kernel(footprint)
+        return self.normal_at(kernel.mean + kernel.sample(sample2), active)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of vertices and lists, bytes."""
+        return super().nbytes + self.lists.nbytes
