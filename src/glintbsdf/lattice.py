@@ -24,18 +24,20 @@ class Axis:
     """One axis of the lattice: ``texels`` texels, wrapped by ``wrap_mode``.
 
     Attributes:
+        block (int): side of a block of quads, a power of two.
         quads (int): quads stored. ``repeat``: one period; ``mirror``: a period of 2 × ``texels``;
             ``clamp``: the map between two borders of whole blocks, which stand for the constant
             strips that go on for ever.
         source (int32 array of ``quads + 1``): the texel shown by each stored vertex.
     """
 
-    def __init__(self, texels: int, wrap_mode: str) -> None:
+    def __init__(self, texels: int, wrap_mode: str, block: int = BLOCK) -> None:
+        self.block = block
         self.clamped = wrap_mode == "clamp"
         if self.clamped:
-            inner_blocks = -(-(BLOCK + texels - 1) // BLOCK)
-            self.quads = (inner_blocks + 1) * BLOCK
-            self.source = np.clip(np.arange(self.quads + 1) - BLOCK, 0, texels - 1)
+            inner_blocks = -(-(block + texels - 1) // block)
+            self.quads = (inner_blocks + 1) * block
+            self.source = np.clip(np.arange(self.quads + 1) - block, 0, texels - 1)
         elif wrap_mode == "mirror":
             self.quads = 2 * texels
             index = np.arange(self.quads + 1) % self.quads
@@ -43,7 +45,7 @@ class Axis:
         else:
             self.quads = texels
             self.source = np.arange(self.quads + 1) % self.quads
-        self.blocks = -(-self.quads // BLOCK)
+        self.blocks = -(-self.quads // block)
 
     def locate(self, x):
         """Where the quad at the position ``x`` (``mi.Int``, texels) is stored.
@@ -54,13 +56,14 @@ class Axis:
         if not self.clamped:
             origin = floor_int((mi.Float(x) + 0.5) * (1 / self.quads)) * self.quads
             return origin, x - origin, mi.Int(self.quads)
-        last = self.quads - BLOCK
-        x = x + BLOCK
+        block = self.block
+        last = self.quads - block
+        x = x + block
         before, after = x < 0, x >= last
         beyond = dr.select(before, x, dr.select(after, x - last, 0))
-        origin = beyond & -BLOCK  # whole blocks, rounded down
-        end = dr.select(before, BLOCK, dr.select(after, self.quads, last))
-        return origin - BLOCK, x - origin, end
+        origin = beyond & -block  # whole blocks, rounded down
+        end = dr.select(before, block, dr.select(after, self.quads, last))
+        return origin - block, x - origin, end
 
     def following(self, x, index):
         """Where the quad after ``x`` is stored, given where ``x`` is."""

@@ -70,6 +70,72 @@ def every_quad(lattice: Lattice, kernel, add, active):
     )[5]
 
 
+def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active) -> mi.Float:
+    """Sum over the entries of the lists that the kernel touches; see :meth:`QuadLists.visit`.
+
+    The lattice's blocks have the side ``1 << shift``, a number or one per lane (``mi.Int``).
+    ``run_of(row of blocks, first block, last block, active)`` returns begin and end of a run of
+    consecutive entries, ``place_of(entry, first row of the row of blocks, active)`` the row and
+    column that an entry stands for, and whatever else ``add`` is to be given. One flat loop,
+    because lanes that walk nested loops wait for each other at the end of every inner one.
+    """
+    columns, rows = lattice.x, lattice.y
+    mean = mi.Vector2f(kernel.mean)
+    bottom = floor_int(mean.y + kernel.reach_v)
+
+    def next_row(x, right, next_y, origin_y, row):
+        """The next row of blocks, and its extent under the kernel."""
+        origin_y, y, end = rows.locate(next_y)
+        row = (y >> shift) << shift
+        next_y = origin_y + dr.minimum(row + (1 << shift), end)
+        start, stop = kernel.row_extent(
+            mi.Float(origin_y + row) - mean.y, mi.Float(next_y) - mean.y
+        )
+        x, right = floor_int(mean.x + start), floor_int(mean.x + stop)
+        return x, right, next_y, origin_y, row
+
+    def next_run(entry, end, x, right, y, next_y, origin_x, origin_y, row, active):
+        """The next run of consecutive entries."""
+        new_row = active & (x > right)
+        y = dr.select(new_row, next_y, y)
+        x, right, next_y, origin_y, row = dr.if_stmt(
+            (x, right, next_y, origin_y, row),
+            new_row,
+            next_row,
+            lambda *state: state,
+            label="next row",
+        )
+        active = active & (y <= bottom)
+        origin_x, column, column_end = columns.locate(x)
+        last = dr.minimum(right - origin_x, column_end - 1) >> shift
+        entry, end = run_of(
+            mi.UInt32(row >> shift), mi.UInt32(column >> shift), mi.UInt32(last), active
+        )
+        x = origin_x + dr.minimum((last + 1) << shift, column_end)
+        return entry, end, x, right, y, next_y, origin_x, origin_y, row, active
+
+    def body(*state):
+        *run, density = state
+        entry, end, active = run[0], run[1], run[-1]
+        run = dr.if_stmt(
+            tuple(run), active & (entry >= end), next_run, lambda *run: run, label="next run"
+        )
+        entry, end, _, _, _, _, origin_x, origin_y, row, active = run
+        found = active & (entry < end)
+        place = place_of(entry, row, found)
+        corner = mi.Vector2f(origin_x + place[1], origin_y + place[0]) - mean
+        density = add(density, *place, corner, found)
+        return entry + 1, *run[1:], density
+
+    none = mi.Int(0)
+    y = floor_int(mean.y - kernel.reach_v)
+    run = (mi.UInt32(0), mi.UInt32(0), none, none - 1, y, y, none, none, none)
+    state = (*(type(v)(v) for v in run), mi.Bool(active), mi.Float(0))
+    return dr.while_loop(
+        state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
+    )[-1]
+
+
 class Packed:
     """An array of unsigned integers, two to a word where 16 bits are enough."""
 
@@ -187,69 +253,23 @@ class QuadLists:
 
         Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice,
         ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
-        it returns the new ``density``. One flat loop, because lanes that walk nested loops wait for
-        each other at the end of every inner one. Sums are differentiable in both modes.
+        it returns the new ``density``. Sums are differentiable in both modes.
         """
-        columns, rows = self.lattice.x, self.lattice.y
-        mean = mi.Vector2f(kernel.mean)
-        count = self.cells.divisions**2
+        count, width = self.cells.divisions**2, self.lattice.x.blocks + 1
         cell = self.cells.cell(m, active)
-        bottom = floor_int(mean.y + kernel.reach_v)
 
-        def next_row(x, right, next_y, origin_y, row, list_index):
-            """The next row of blocks, and its extent under the kernel."""
-            origin_y, y, end = rows.locate(next_y)
-            block = y >> SHIFT
-            row = block << SHIFT
-            next_y = origin_y + dr.minimum(row + BLOCK, end)
-            start, stop = kernel.row_extent(
-                mi.Float(origin_y + row) - mean.y, mi.Float(next_y) - mean.y
-            )
-            x, right = floor_int(mean.x + start), floor_int(mean.x + stop)
-            return x, right, next_y, origin_y, row, mi.UInt32(block) * count + cell
-
-        def next_run(entry, end, x, right, y, next_y, origin_x, origin_y, row, list_index, active):
-            """The next run of consecutive entries."""
-            new_row = active & (x > right)
-            y = dr.select(new_row, next_y, y)
-            x, right, next_y, origin_y, row, list_index = dr.if_stmt(
-                (x, right, next_y, origin_y, row, list_index),
-                new_row,
-                next_row,
-                lambda *state: state,
-                label="next row",
-            )
-            active = active & (y <= bottom)
-            origin_x, column, column_end = columns.locate(x)
-            last = dr.minimum(right - origin_x, column_end - 1) >> SHIFT
-            first_offset = list_index * (columns.blocks + 1)
+        def run_of(block_row, first, last, active):
+            list_index = block_row * count + cell
             start = dr.gather(mi.UInt32, self.start, list_index, active)
-            entry = start + self.offset[first_offset + mi.UInt32(column >> SHIFT), active]
-            end = start + self.offset[first_offset + mi.UInt32(last + 1), active]
-            x = origin_x + dr.minimum((last + 1) << SHIFT, column_end)
-            return entry, end, x, right, y, next_y, origin_x, origin_y, row, list_index, active
-
-        def body(*state):
-            *run, density = state
-            entry, end, active = run[0], run[1], run[-1]
-            run = dr.if_stmt(
-                tuple(run), active & (entry >= end), next_run, lambda *run: run, label="next run"
+            return tuple(
+                start + self.offset[list_index * width + k, active] for k in (first, last + 1)
             )
-            entry, end, _, _, _, _, origin_x, origin_y, row, _, active = run
-            found = active & (entry < end)
-            quad = mi.Int(self.entries[entry, found])
-            quad_row, quad_column = row + (quad & (BLOCK - 1)), quad >> SHIFT
-            corner = mi.Vector2f(origin_x + quad_column, origin_y + quad_row) - mean
-            density = add(density, quad_row, quad_column, corner, found)
-            return entry + 1, *run[1:], density
 
-        none = mi.Int(0)
-        y = floor_int(mean.y - kernel.reach_v)
-        run = (mi.UInt32(0), mi.UInt32(0), none, none - 1, y, y, none, none, none, mi.UInt32(0))
-        state = (*(type(v)(v) for v in run), mi.Bool(active), mi.Float(0))
-        return dr.while_loop(
-            state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
-        )[-1]
+        def quad_of(entry, row, found):
+            quad = mi.Int(self.entries[entry, found])
+            return row + (quad & (BLOCK - 1)), quad >> SHIFT
+
+        return walk(self.lattice, SHIFT, kernel, run_of, quad_of, add, active)
 
     # --------------------------------------------------------------------------------------------
     #  Building
@@ -263,7 +283,7 @@ class QuadLists:
         and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
         rectangle (lower, upper), inside which all triangles lie.
         """
-        return _Builder(lattice, triangles, normals, bounds).arrays()
+        return Builder(BlocksOfQuads(lattice, triangles), normals, bounds).arrays()
 
 
 def reaches(triangle, centre, half):
@@ -284,24 +304,53 @@ def reaches(triangle, centre, half):
     return meets
 
 
-class _Builder:
+class BlocksOfQuads:
+    """What :class:`Builder` makes lists of: here, the quads of a lattice.
+
+    Attributes:
+        rows, columns (int): blocks.
+        mean_count (float): quads in a block, on average.
+        largest_entry (int): bounds the entries.
+    """
+
+    def __init__(self, lattice: Lattice, triangles) -> None:
+        self.lattice, self.triangles_of_quad = lattice, triangles
+        self.rows, self.columns = lattice.y.blocks, lattice.x.blocks
+        self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
+
+    def count(self, block_row, block_column):
+        """How many quads a block has."""
+        return BLOCK**2
+
+    def triangles(self, block_row, block_column, quad, active):
+        """Whether the ``quad``-th of a block exists, and its two triangles."""
+        row = block_row * BLOCK + (quad >> SHIFT)
+        column = block_column * BLOCK + (quad & (BLOCK - 1))
+        exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
+        return exists, self.triangles_of_quad(row, column, exists)
+
+    def entry(self, block_row, block_column, quad):
+        """What the lists say of the ``quad``-th of a block."""
+        return ((block_column * BLOCK + (quad & (BLOCK - 1))) << SHIFT) | (quad >> SHIFT)
+
+
+class Builder:
     """Scan of all quads against all cells they reach, one lane per block of quads.
 
     A lane alone touches the counters of its block, so the order of the entries, and with it every
     later sum, is the same on all machines.
     """
 
-    def __init__(self, lattice, triangles, normals, bounds) -> None:
-        self.lattice, self.triangles, self.normals = lattice, triangles, normals
+    def __init__(self, blocks, normals, bounds, bytes_per_quad: float = BYTES_PER_QUAD) -> None:
+        self.blocks, self.normals, self.allowed = blocks, normals, bytes_per_quad
         self.lower, self.upper = (np.asarray(v, np.float32) for v in bounds)
-        self.rows, self.columns = lattice.y.blocks, lattice.x.blocks
+        self.rows, self.columns = blocks.rows, blocks.columns
 
     def arrays(self) -> dict[str, np.ndarray]:
-        divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= BYTES_PER_QUAD)
+        divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= self.allowed)
         tables = self.use(divisions)
         cells = divisions**2
-        row_quads = self.lattice.x.quads * BLOCK
-        index_type = np.uint16 if row_quads < 1 << 16 else np.uint32
+        index_type = np.uint16 if self.blocks.largest_entry < 1 << 16 else np.uint32
 
         offset = np.zeros((self.rows, cells, self.columns + 1), index_type)
         total = np.zeros((self.rows, cells), np.int64)
@@ -349,8 +398,9 @@ class _Builder:
         row, column = (mi.UInt32(v) for v in divmod(sample, self.columns))
         counter = dr.zeros(mi.UInt32, 1)
         self.scan(row, column, lambda cell: mi.UInt32(0), counter)
-        entries = counter[0] / (len(sample) * BLOCK**2)
-        return 2 * entries + (2 + 6 / (self.columns + 1)) * (divisions / BLOCK) ** 2
+        entries = counter[0] / (len(sample) * self.blocks.mean_count)
+        offsets = (2 + 6 / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
+        return 2 * entries + offsets
 
     def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
         """Scan the rows of blocks of a strip.
@@ -376,7 +426,8 @@ class _Builder:
 
     def scan(self, block_row, block_column, counter_of_cell, counters, entries=None) -> None:
         """For all quads of the given blocks, count or enter them in the cells that they reach."""
-        lattice, cells = self.lattice, self.cells
+        cells, blocks = self.cells, self.blocks
+        count = blocks.count(block_row, block_column)
 
         def cell_range(slab, lower, upper, active):
             return (
@@ -386,13 +437,9 @@ class _Builder:
 
         def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active):
             quad = quad + 1
-            active = active & (quad < BLOCK**2)
-            row = block_row * BLOCK + (quad >> SHIFT)
-            column = block_column * BLOCK + (quad & (BLOCK - 1))
-            exists = active & (row < lattice.y.quads) & (column < lattice.x.quads)
-            first, second = (
-                tuple(mi.Vector2f(v) for v in t) for t in self.triangles(row, column, exists)
-            )
+            active = active & (quad < count)
+            exists, triangles = blocks.triangles(block_row, block_column, quad, active)
+            first, second = (tuple(mi.Vector2f(v) for v in t) for t in triangles)
             corners = [t[0] + e for t in (first, second) for e in (mi.Vector2f(0), t[1], t[2])]
             lowest, highest = corners[0], corners[0]
             for corner in corners[1:]:
@@ -432,8 +479,7 @@ class _Builder:
             found = inside & (reaches(first, centre, half) | reaches(second, centre, half))
             slot = dr.scatter_inc(counters, counter_of_cell(s * cells.divisions + c), found)
             if entries is not None:
-                column = block_column * BLOCK + (quad & (BLOCK - 1))
-                dr.scatter(entries, (column << SHIFT) | (quad >> SHIFT), slot, found)
+                dr.scatter(entries, blocks.entry(block_row, block_column, quad), slot, found)
 
             cell = cell + 1
             next_slab = inside & (cell > last_cell)
