@@ -1,4 +1,4 @@
-"""The base class of every glint BSDF: a microfacet BRDF around a P-NDF.
+"""The base classes: BSDFs that see a footprint, and glint BSDFs, microfacet BRDFs around a P-NDF.
 
 ``mi.BSDF`` is another class in every variant of Mitsuba, so this module is imported anew for each
 (see ``registration.py``).
@@ -15,7 +15,70 @@ from .footprint import Footprint, is_literal_zero
 from .parameters import Parameters
 
 
-class GlintBSDF(mi.BSDF):
+class FootprintBSDF(mi.BSDF):
+    """A BSDF that depends on the footprint: its parameters, and what follows from them.
+
+    Attributes:
+        owner, name (str): type and id of the plugin, as errors and warnings name them.
+        to_uv (mi.ScalarAffineTransform3f): transform of UV space.
+        footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
+
+    Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.owner, self.name = props.plugin_name(), props.id()
+        parameters = Parameters(props)
+        self.to_uv = parameters.to_uv()
+        self.footprint_sigma = mi.Float(parameters.number("footprint_sigma", 0.5))
+        self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
+        self.warned_of_point_footprint = False
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+        callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
+        callback.put("footprint_sigma", self.footprint_sigma, flags)
+        callback.put("pixel_spread", self.pixel_spread, flags)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        for key in {"footprint_sigma", "pixel_spread"} & set(keys):
+            value = getattr(self, key)
+            check(dr.all(dr.isfinite(value) & (value >= 0)),
+                  self.owner, key, "a finite number ≥ 0", value)
+
+    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
+        """The footprint at ``si`` in the UV space of the map."""
+        footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
+        if footprint.is_known_to_be_zero() and not is_literal_zero(self.footprint_sigma):
+            self.warn_of_point_footprint()
+        return footprint if self.to_uv == type(self.to_uv)() else footprint.transformed(self.to_uv)
+
+    def warn_of_point_footprint(self) -> None:
+        """Say, once, that nothing tells how large a pixel is."""
+        if not self.warned_of_point_footprint:
+            self.warned_of_point_footprint = True
+            mi.Log(mi.LogLevel.Warn,
+                   f'{self.owner} "{self.name}": the integrator gives no footprint and '
+                   '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
+                   'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
+                   'set "pixel_spread" to the angle of a pixel in radians.')
+
+    def members(self) -> dict[str, object]:
+        """What describes this BSDF in print, by name; None is left out."""
+        return {
+            "to_uv": None if self.to_uv == type(self.to_uv)() else self.to_uv,
+            "footprint_sigma": self.footprint_sigma[0],
+            "pixel_spread": self.pixel_spread[0],
+        }
+
+    def to_string(self) -> str:
+        lines = [f"  {name} = {value}".replace("\n", "\n  ")
+                 for name, value in self.members().items() if value is not None]
+        return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
+
+
+class GlintBSDF(FootprintBSDF):
     """A one-sided glossy BRDF, ``F D G / (4 cosθ_i cosθ_o)``, with D the P-NDF of a footprint.
 
     The base class reads the parameters that all glint BSDFs share and implements Mitsuba's
@@ -35,35 +98,25 @@ class GlintBSDF(mi.BSDF):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.owner, self.name = props.plugin_name(), props.id()
         parameters = Parameters(props)
-        self.to_uv = parameters.to_uv()
-        self.footprint_sigma = mi.Float(parameters.number("footprint_sigma", 0.5))
-        self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
         self.fresnel = parameters.fresnel()
         self.specular_reflectance = parameters.specular_reflectance()
-        self.warned_of_point_footprint = False
 
         self.m_flags = (mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
                         | mi.BSDFFlags.SpatiallyVarying | mi.BSDFFlags.Anisotropic)
         self.m_components = [self.m_flags]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        smooth, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.Discontinuous
         self.pndf.traverse(callback)
-        callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
-        callback.put("footprint_sigma", self.footprint_sigma, smooth | discontinuous)
-        callback.put("pixel_spread", self.pixel_spread, smooth | discontinuous)
+        super().traverse(callback)
         if self.fresnel is not None:
             self.fresnel.traverse(callback)
         if self.specular_reflectance is not None:
-            callback.put("specular_reflectance", self.specular_reflectance, smooth)
+            callback.put("specular_reflectance", self.specular_reflectance,
+                         mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
-        for key in {"footprint_sigma", "pixel_spread"} & set(keys):
-            value = getattr(self, key)
-            check(dr.all(dr.isfinite(value) & (value >= 0)),
-                  self.owner, key, "a finite number ≥ 0", value)
+        super().parameters_changed(keys)
         self.pndf.parameters_changed(keys)
         if self.masking is not None:
             self.masking.parameters_changed()
@@ -134,7 +187,7 @@ class GlintBSDF(mi.BSDF):
         """
         cos_theta_i = mi.Frame3f.cos_theta(si.wi)
         active = mi.Bool(active) & (cos_theta_i > 0)
-        albedo = self.tint(si, active)
+        albedo = self.mean_tint(si, active)
         if self.fresnel is not None:
             cos_theta_i = dr.select(active, cos_theta_i, 1)
             albedo = albedo * self.fresnel.reflectance(cos_theta_i, si, active)
@@ -150,28 +203,15 @@ class GlintBSDF(mi.BSDF):
         """What normals are drawn from: an object with the methods of ``PndfNormals``."""
         return microfacet.PndfNormals(self.pndf)
 
-    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
-        """The footprint at ``si`` in the UV space of the map."""
-        footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
-        if footprint.is_known_to_be_zero() and not is_literal_zero(self.footprint_sigma):
-            self.warn_of_point_footprint()
-        return footprint if self.to_uv == type(self.to_uv)() else footprint.transformed(self.to_uv)
-
-    def warn_of_point_footprint(self) -> None:
-        """Say, once, that nothing tells how large a pixel is."""
-        if not self.warned_of_point_footprint:
-            self.warned_of_point_footprint = True
-            mi.Log(mi.LogLevel.Warn,
-                   f'{self.owner} "{self.name}": the integrator gives no footprint and '
-                   '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
-                   'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
-                   'set "pixel_spread" to the angle of a pixel in radians.')
-
     def tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """``specular_reflectance`` at ``si``."""
         if self.specular_reflectance is None:
             return mi.UnpolarizedSpectrum(1)
         return self.specular_reflectance.eval(si, active)
+
+    def mean_tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """What tints the surface as seen from afar, where the P-NDF may have colours of its own."""
+        return self.tint(si, active)
 
     def reflected(self, value: mi.Float | mi.UnpolarizedSpectrum, ctx: mi.BSDFContext,
                   si: mi.SurfaceInteraction3f, wi: mi.Vector3f, wo: mi.Vector3f, m: mi.Vector3f,
@@ -189,16 +229,11 @@ class GlintBSDF(mi.BSDF):
                 spectrum = spectrum * self.fresnel.reflectance(dr.dot(wo, m), si, active)
         return dr.select(active, spectrum, 0)
 
-    def to_string(self) -> str:
-        members = {
+    def members(self) -> dict[str, object]:
+        return {
             "pndf": self.pndf,
             "masking": self.masking,
             "fresnel": self.fresnel,
             "specular_reflectance": self.specular_reflectance,
-            "to_uv": None if self.to_uv == type(self.to_uv)() else self.to_uv,
-            "footprint_sigma": self.footprint_sigma[0],
-            "pixel_spread": self.pixel_spread[0],
+            **super().members(),
         }
-        lines = [f"  {name} = {value}".replace("\n", "\n  ")
-                 for name, value in members.items() if value is not None]
-        return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"

@@ -74,6 +74,29 @@ class PndfNormals:
         return density * m.z
 
 
+class VisibleBeckmannNormals:
+    """Draws the normals that a smooth Beckmann surface shows to the view (Heitz and d'Eon 2014).
+
+    Args:
+        alpha: ``mi.Vector2f``, roughness along u and v.
+    """
+
+    def __init__(self, alpha: mi.Vector2f) -> None:
+        self.distribution = mi.MicrofacetDistribution(
+            mi.MicrofacetType.Beckmann, alpha.x, alpha.y, sample_visible=True
+        )
+
+    def sample(self, wi: mi.Vector3f, footprint: Footprint, sample1: mi.Float, sample2: mi.Point2f,
+               active: mi.Bool) -> mi.Vector3f:
+        """As :meth:`PndfNormals.sample`."""
+        return mi.Vector3f(self.distribution.sample(wi, sample2)[0])
+
+    def pdf(self, wi: mi.Vector3f, m: mi.Vector3f, density: mi.Float, footprint: Footprint,
+            active: mi.Bool) -> mi.Float:
+        """As :meth:`PndfNormals.pdf`; ``density`` plays no part."""
+        return self.distribution.pdf(wi, m)
+
+
 # --------------------------------------------------------------------------------------------------
 #  Fresnel reflectance
 # --------------------------------------------------------------------------------------------------

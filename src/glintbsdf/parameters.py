@@ -16,6 +16,7 @@ from math import inf, isfinite
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from .errors import ParameterError, check, check_choice
 from .microfacet import Conductor, Dielectric
@@ -43,6 +44,14 @@ class Parameters:
         check(is_number and isfinite(value) and value >= minimum,
               self.owner, name, requirement, value)
         return float(value)
+
+    def per_axis(self, name: str, default: float) -> tuple[float, float]:
+        """``name_u`` and ``name_v``, or ``name`` for both: finite numbers ≥ 0."""
+        axes = (f"{name}_u", f"{name}_v")
+        self.only_one_of((name,), axes)
+        if name in self.props:
+            default = self.number(name, default)
+        return tuple(self.number(axis, default) for axis in axes)
 
     def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
         """One of the strings ``choices``."""
@@ -106,6 +115,38 @@ class Parameters:
         check(all(map(isfinite, entries)) and determinant != 0,
               self.owner, "to_uv", "a finite, invertible transform of the UV plane", entries)
         return to_uv
+
+    # ----------------------------------------------------------------------------------------------
+    #  Colours
+    # ----------------------------------------------------------------------------------------------
+
+    def colors(self, name: str, choices: tuple[str, ...]) -> str | np.ndarray:
+        """One of the strings ``choices``, or the colours of an image: linear RGB, N×3, float32.
+
+        The image comes from a file, whose relative name is resolved as that of a map, or from an
+        ``mi.Bitmap``. Integer pixels are sRGB unless the bitmap says otherwise, as everywhere in
+        Mitsuba. Colours must be finite and not negative.
+        """
+        value = self.props.get(name, choices[0])
+        if isinstance(value, str) and value in choices:
+            return value
+        requirement = f"one of {', '.join(choices)}, the name of an image file or an mi.Bitmap"
+        bitmap = value
+        if isinstance(value, str):
+            path = Path(str(mi.file_resolver().resolve(value)))
+            check(path.is_file(), self.owner, name, requirement, value)
+            try:
+                bitmap = mi.Bitmap(str(path))
+            except RuntimeError as error:
+                raise ParameterError(f'{self.owner}: "{name}" must be a readable image file '
+                                     f'(got "{value}": {error})') from error
+        check(isinstance(bitmap, mi.Bitmap), self.owner, name, requirement, value)
+        pixels = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+        pixels = pixels.reshape(-1, 3)
+        bad = ~(np.isfinite(pixels) & (pixels >= 0)).all(axis=1)
+        check(len(pixels) > 0 and not bad.any(), self.owner, name,
+              "an image of finite colours ≥ 0", f"{bad.sum()} other pixels of {len(pixels)}")
+        return pixels
 
     # ----------------------------------------------------------------------------------------------
     #  The material

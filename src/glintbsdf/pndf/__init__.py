@@ -1,5 +1,6 @@
 """Estimators of the P-NDF, the distribution of normals seen through a footprint."""
 
+from .grid import Grid
 from .manifold import Manifold
 
-__all__ = ["Manifold"]
+__all__ = ["Grid", "Manifold"]

@@ -1,0 +1,225 @@
+r"""
+.. _bsdf-glint_grid:
+
+Procedural glints and grooves (:monosp:`glint_grid`)
+----------------------------------------------------
+
+.. pluginparameters::
+
+ * - alpha, or alpha_u and alpha_v
+   - |float|
+   - Beckmann roughness of the surface as it looks from afar, along both or each of the axes u and
+     v, at least :monosp:`1e-4`. (Default: 0.3)
+   - |exposed|, |differentiable|
+
+ * - detail_alpha, or detail_alpha_u and detail_alpha_v
+   - |float|
+   - Roughness of a single microdetail: greater than 0, and at most that of the surface. Where it is
+     equal to the surface's along one axis, microdetails become endless grooves along that axis.
+     (Default: 0.05)
+   - |exposed|
+
+ * - density
+   - |float|
+   - Decimal logarithm of the number of microdetails per unit of UV area, from -20 to 20. One of
+     them is as wide as :monosp:`10^(-density/2)` in UV. (Default: 8)
+   - |exposed|
+
+ * - size_variation
+   - |float|
+   - Standard deviation, at least 0, of the number of microdetails in equal areas, relative to its
+     mean: some places have many small ones, others a few large. (Default: 0.3)
+   - |exposed|
+
+ * - intensity
+   - |float|
+   - Factor on all of the reflection, at least 0. Above 1 the surface may reflect more than it
+     receives. (Default: 1)
+   - |exposed|, |differentiable|
+
+ * - light_spread
+   - |float|
+   - Half angle of the cone, in radians from 0 to less than :math:`\pi/2`, that the light fills as
+     seen from the surface. A wide light finds more microdetails that mirror it, so that glints grow
+     weaker and the surface smoother. What the light's shape does to its highlight is the
+     renderer's part. (Default: 0, a point)
+   - |exposed|
+
+ * - colors
+   - |string| or :monosp:`mitsuba.Bitmap`
+   - Colours of the microdetails: :monosp:`none`; :monosp:`wheel`, all hues, which together make
+     white; or a palette, each pixel of an image being as likely as the others: the name of a file,
+     relative to the scene's folder, or a bitmap. From afar the surface has the palette's mean
+     colour. (Default: :monosp:`none`)
+
+ * - max_anisotropy
+   - |float|
+   - Largest ratio, at least 1, of the length and width of a pixel on the surface that is resolved;
+     beyond it, at grazing angles, pixels count as wider. Limits the cost. (Default: 16)
+   - |exposed|
+
+ * - seed
+   - |int|
+   - Another number gives other microdetails. (Default: 0)
+
+ * - to_uv
+   - |transform|
+   - Transform of the UV coordinates, as for a bitmap texture. The axes of the roughness stay those
+     of the surface: grooves need a transform that does not rotate. (Default: none)
+   - |exposed|
+
+ * - footprint_sigma
+   - |float|
+   - Standard deviation of the footprint in pixels; the pixel is taken to be two of them wide.
+     (Default: 0.5)
+   - |exposed|
+
+ * - pixel_spread
+   - |float|
+   - Angle of a pixel in radians, divided by the square root of the samples per pixel: the size of
+     the footprint in integrators that tell none, which are all but :monosp:`glint_path`.
+     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+   - |exposed|
+
+ * - material
+   - |string|
+   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
+
+ * - eta, k
+   - |spectrum| or |texture|
+   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
+     (Default: 0 and 1 where only the other is given)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - int_ior, ext_ior
+   - |float| or |string|
+   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
+     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
+     :monosp:`bk7` and :monosp:`air` where only the other is given)
+
+ * - specular_reflectance
+   - |spectrum| or |texture|
+   - Factor on the reflection, in [0, 1]. (Default: 1)
+   - |exposed|, |differentiable|
+
+Glitter, snow, sand and brushed metal from a few parameters: no map, no memory, no precomputation.
+Microdetails, each a small lobe of roughness :monosp:`detail_alpha`, are strewn over the surface and
+over the directions that they face, so that all together make the Beckmann lobe of roughness
+:monosp:`alpha` :cite:`Zirr16Multiscale`. Where a pixel covers few of them they show as glints, or,
+long along one axis, as grooves; where it covers many, the surface is that of
+:monosp:`roughconductor` with the distribution :monosp:`beckmann`. Their positions belong to the UV
+coordinates, whatever the camera does, and the number that reflects in a pixel is drawn at random,
+but always alike, from hashed numbers of the cells that the pixel covers, on a hierarchy of grids:
+
+.. math::
+
+    D(m) = D_g(m) \sum_C w_C \frac{n_C}{N_C P(m)}, \qquad
+    n_C \sim B(N_C, P(m)), \qquad P(m) = \frac{D_g(m)}{D_l(0)}
+
+with weights :math:`w_C` of the cells that add up to one, :math:`N_C` microdetails in a cell, of
+which :math:`n_C` reflect. On average over places :math:`D = D_g` exactly. A single place is *not*
+normalised: too many microdetails in one direction are not made up for in others, and it may reflect
+more than it receives. Sampling draws from the visible normals of the smooth surface; the weight of
+a sample holds the glints.
+
+Stretched UV coordinates stretch microdetails, and what is finer than four spacings of float32 UV
+coordinates is not resolved. Derivatives with respect to roughness are those of the smooth surface
+times the glints, which stay; they are exact on average.
+
+The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
+inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
+coordinates.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: lst-glint_grid
+
+        <bsdf type="glint_grid">
+            <float name="alpha" value="0.4"/>
+            <float name="detail_alpha" value="0.03"/>
+            <float name="density" value="6.5"/>
+            <string name="colors" value="wheel"/>
+            <string name="material" value="Al"/>
+        </bsdf>
+
+    .. code-tab:: python
+
+        'type': 'glint_grid',
+        'alpha': 0.4,
+        'detail_alpha': 0.03,
+        'density': 6.5,
+        'colors': 'wheel',
+        'material': 'Al'
+
+Reference: Tobias Zirr and Anton S. Kaplanyan, "Real-time Rendering of Procedural Multiscale
+Materials" (:cite:`Zirr16Multiscale`).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.bsdf import GlintBSDF
+from glintbsdf.footprint import Footprint
+from glintbsdf.microfacet import BeckmannMasking, VisibleBeckmannNormals
+from glintbsdf.parameters import Parameters
+from glintbsdf.pndf import Grid
+from glintbsdf.pndf.grid import Palette, Wheel
+from glintbsdf.spectra import ColorConversion
+
+
+class GlintGrid(GlintBSDF):
+    """The plugin ``glint_grid``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        parameters = Parameters(props)
+        colors = parameters.colors("colors", ("none", "wheel"))
+        if isinstance(colors, str):
+            colors = {"none": None, "wheel": Wheel()}[colors]
+        else:
+            colors = Palette(colors)
+        self.color_conversion = None if colors is None else ColorConversion()
+        self.pndf = Grid(
+            alpha=parameters.per_axis("alpha", 0.3),
+            detail_alpha=parameters.per_axis("detail_alpha", 0.05),
+            density=parameters.number("density", 8.0, minimum=-20.0),
+            size_variation=parameters.number("size_variation", 0.3),
+            intensity=parameters.number("intensity", 1.0),
+            light_spread=parameters.number("light_spread", 0.0),
+            colors=colors,
+            max_anisotropy=parameters.number("max_anisotropy", 16.0, minimum=1.0),
+            seed=props.get("seed", 0),
+            owner=self.owner,
+        )
+        self.derive()
+
+    def derive(self) -> None:
+        """What depends on the roughness."""
+        self.visible_normals = VisibleBeckmannNormals(self.pndf.alpha)
+        self.masking = BeckmannMasking(dr.square(self.pndf.alpha), height_correlated=False)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        super().parameters_changed(keys)
+        self.derive()
+
+    def normals(self) -> VisibleBeckmannNormals:
+        return self.visible_normals
+
+    def density(
+        self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float | mi.UnpolarizedSpectrum:
+        density = super().density(si, m, footprint, active)
+        if self.color_conversion is None:
+            return density
+        return self.color_conversion.eval(density, si, active)
+
+    def mean_tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        tint = self.pndf.intensity * super().mean_tint(si, active)
+        if self.color_conversion is None:
+            return tint
+        return tint * self.color_conversion.eval(mi.Color3f(*self.pndf.colors.mean), si, active)
+
+
+mi.register_bsdf("glint_grid", lambda props: GlintGrid(props))
