@@ -118,6 +118,7 @@ def render(
 
     Raises:
         ValueError: no sensor, or a mesh without the UVs that its BSDF needs.
+        KeyboardInterrupt: also where Mitsuba itself has caught the signal.
     """
     if not scene.sensors():
         raise ValueError("the scene has no sensor")
@@ -137,6 +138,9 @@ def render(
             # Seeds of neighbouring images must not share passes.
             pass_seed = mi.sample_tea_32(seed, index)[0] if passes > 1 else seed
             scene.integrator().render(scene, sensor, seed=pass_seed, spp=spp // passes)
+            if scene.integrator().should_stop():
+                # Mitsuba caught Ctrl-C during the pass, and Python was not told.
+                raise KeyboardInterrupt
             bitmap = sensor.film().bitmap()
             total = total + np.array(bitmap, dtype=np.float64)
             report((index + 1) / passes)
