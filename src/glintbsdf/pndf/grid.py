@@ -30,7 +30,7 @@ MAX_LEVEL = 40
 UV_RESOLUTION = 2.0**-22
 
 #: Half the shortest median that is walked, in cells. It keeps the weights free of 0/0.
-MIN_HALF_MEDIAN = 0.01
+MIN_HALF_MEDIAN = 1e-3
 
 #: The smallest roughness that Mitsuba's Beckmann distribution, which is sampled, can have.
 MIN_ALPHA = 1e-4
@@ -120,13 +120,14 @@ class CoveredCells:
         """What a walk over one grid needs, in its cells, relative to the vertex before the centre.
 
         Returns its level and weight, that vertex (p, q), the centre relative to it, half the
-        median along p, and the first of the columns.
+        median along p, the first column and the number of columns.
         """
         spacing = power_of_two(-level)
         centre = self.centre * spacing
         origin = dr.floor(centre)
         centre = centre - origin
         half = dr.maximum(self.half * spacing, MIN_HALF_MEDIAN)
+        first = floor_int(centre.x - half)
         return (
             level,
             weight,
@@ -135,7 +136,8 @@ class CoveredCells:
             centre.x,
             centre.y,
             half,
-            floor_int(centre.x - half),
+            first,
+            floor_int(centre.x + half) + 2 - first,
         )
 
     def sum(self, term, zero, active):
@@ -144,15 +146,14 @@ class CoveredCells:
         ``zero`` is the empty sum; ``term`` must return the same type.
         """
         grids = self.grid(self.level, 1 - self.blend), self.grid(self.level + 1, self.blend)
-        # Columns from the first to that right of the median's end
-        counts = [floor_int(grid[4] + grid[6]) + 2 - grid[7] for grid in grids]
+        finer_columns, coarser_columns = (grid[-1] for grid in grids)
 
         def column(step, total):
-            finer = step < counts[0]
-            level, weight, p0, q0, p, q, half, first = (
+            finer = step < finer_columns
+            level, weight, p0, q0, p, q, half, first, _ = (
                 dr.select(finer, *pair) for pair in zip(*grids, strict=True)
             )
-            i = first + dr.select(finer, step, step - counts[0])
+            i = first + dr.select(finer, step, step - finer_columns)
             x = mi.Float(i)
             weight = weight * (tent_integral(p + half - x) - tent_integral(p - half - x))
             weight = weight / (2 * half)
@@ -166,7 +167,7 @@ class CoveredCells:
                 total = total + share * term(vertex.x, vertex.y, level, active & (share > 0))
             return step + 1, total
 
-        end = counts[0] + counts[1]
+        end = finer_columns + coarser_columns
         _, total = dr.while_loop(
             (mi.Int(0), zero), lambda step, total: active & (step < end), column, label="cells"
         )
