@@ -61,6 +61,21 @@ def effective_triangle(a, b, c, centre, epsilon):
     )
 
 
+def normal_in_quad(l1, l2, normals, epsilon):
+    """The normal n(u) of a quad's effective triangles at the place (``l1``, ``l2``) ∈ [0, 1]²."""
+    n0, n1, n2, n3 = normals
+    upper = l1 + l2 < 1
+    l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
+    a, e1, e2 = effective_triangle(
+        dr.select(upper, n0, n3),
+        dr.select(upper, n1, n2),
+        dr.select(upper, n2, n1),
+        0.5 * (n1 + n2),
+        epsilon,
+    )
+    return a + e1 * l1 + e2 * l2
+
+
 # ------------------------------------------------------------------------------------------------
 #  Eq. 5: evaluation
 # ------------------------------------------------------------------------------------------------
@@ -201,16 +216,7 @@ class TexelMesh:
         n0, n1, n2, n3 = self.quad_normals(
             self.lattice.y.locate(row)[1], self.lattice.x.locate(column)[1], active
         )
-        upper = l1 + l2 < 1
-        l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
-        a, e1, e2 = effective_triangle(
-            dr.select(upper, n0, n3),
-            dr.select(upper, n1, n2),
-            dr.select(upper, n2, n1),
-            0.5 * (n1 + n2),
-            self.epsilon,
-        )
-        return a + e1 * l1 + e2 * l2
+        return normal_in_quad(l1, l2, (n0, n1, n2, n3), self.epsilon)
 
     def texel_kernel(self, footprint) -> TexelKernel:
         """k(u − x) of Eq. 2 for this map."""
