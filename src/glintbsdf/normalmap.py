@@ -35,7 +35,7 @@ WRAP_MODES = ("repeat", "mirror", "clamp")
 MAP_TYPES = ("auto", "normal", "height")
 
 _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
-_MAX_SLOPE = 1000
+MAX_SLOPE = 1000
 
 # What makes a map among the channels of an EXR file, the most telling names first.
 _EXR_LAYOUTS = (("R", "G", "B"), ("X", "Y", "Z"), ("R", "G"), ("X", "Y"), ("Y",))
@@ -66,7 +66,7 @@ class NormalMap:
             normals = np.array(normals, dtype=np.float32, order="C")
             squared_length = np.einsum("ijk,ijk->ij", normals, normals, dtype=np.float64)
         finite = np.isfinite(normals).all(axis=2)
-        _check_texels(owner, parameter, "normals inside the unit disk, x² + y² < 1", {
+        check_texels(owner, parameter, "normals inside the unit disk, x² + y² < 1", {
             "NaN or infinite": ~finite,
             "outside the disk": finite & ~(squared_length < 1)})
 
@@ -220,7 +220,7 @@ def _as_fractions(data: np.ndarray) -> np.ndarray:
 def _normals_from_height(height: np.ndarray, height_scale: float, wrap_mode: str,
                          owner: str, parameter: str) -> np.ndarray:
     """``n ∝ (-∂h/∂x, -∂h/∂y, 1)`` by central differences, in texels."""
-    _check_texels(owner, parameter, "finite heights", {"NaN or infinite": ~np.isfinite(height)})
+    check_texels(owner, parameter, "finite heights", {"NaN or infinite": ~np.isfinite(height)})
     # Mirrored about the border, the texel beyond it is the border texel itself, as when clamped.
     padded = np.pad(height, 1, mode="wrap" if wrap_mode == "repeat" else "edge")
     scale = 0.5 * float(height_scale)
@@ -229,8 +229,8 @@ def _normals_from_height(height: np.ndarray, height_scale: float, wrap_mode: str
         slope_y = scale * (padded[2:, 1:-1] - padded[:-2, 1:-1])
         length = np.hypot(np.hypot(slope_x, slope_y), 1)
     # Steeper ones would be horizontal in float32.
-    _check_texels(owner, parameter, f"a height with slopes below {_MAX_SLOPE}, after height_scale",
-                  {"steeper": ~(length < _MAX_SLOPE)})
+    check_texels(owner, parameter, f"a height with slopes below {MAX_SLOPE}, after height_scale",
+                  {"steeper": ~(length < MAX_SLOPE)})
     return np.stack((-slope_x / length, -slope_y / length), axis=2)
 
 
@@ -238,7 +238,7 @@ def _project(vectors: np.ndarray, owner: str, parameter: str) -> np.ndarray:
     """Normalise vectors (x, y, z), which rounding to 8 bits leaves off the sphere, and drop z."""
     finite = np.isfinite(vectors).all(axis=2)
     zero = ~vectors.any(axis=2)
-    _check_texels(owner, parameter, "normals that are finite, non-zero and face up, z > 0", {
+    check_texels(owner, parameter, "normals that are finite, non-zero and face up, z > 0", {
         "NaN or infinite": ~finite,
         "zero": zero,
         "down-facing": finite & ~zero & ~(vectors[..., 2] > 0)})
@@ -250,7 +250,7 @@ def _project(vectors: np.ndarray, owner: str, parameter: str) -> np.ndarray:
 # Telling what is wrong
 # -------------------------------------------------------------------------------------------------
 
-def _check_texels(owner: str, parameter: str, requirement: str,
+def check_texels(owner: str, parameter: str, requirement: str,
                   faults: Mapping[str, np.ndarray]) -> None:
     """Raise unless every H x W mask of ``faults`` is empty; tell each count and the first place."""
     counts = {fault: int(np.count_nonzero(mask)) for fault, mask in faults.items()}

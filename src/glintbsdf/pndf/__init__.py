@@ -1,6 +1,7 @@
 """Estimators of the P-NDF, the distribution of normals seen through a footprint."""
 
+from .filtered import Filtered
 from .grid import Grid
 from .manifold import Manifold
 
-__all__ = ["Grid", "Manifold"]
+__all__ = ["Filtered", "Grid", "Manifold"]

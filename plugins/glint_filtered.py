@@ -1,0 +1,208 @@
+r"""
+.. _bsdf-glint_filtered:
+
+Smooth filters of a normal map (:monosp:`glint_filtered`)
+---------------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Image file of the normal or height map: OpenEXR, PNG, TIFF and what else Mitsuba reads. A
+     relative name counts from the scene's folder.
+
+ * - bitmap
+   - :monosp:`mitsuba.Bitmap`
+   - The map itself, instead of :monosp:`filename`, when the scene is built in Python.
+
+ * - data
+   - |tensor|
+   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
+     the map in use: the projected normals, H×W×2.
+   - |exposed|, |differentiable|
+
+ * - map_type
+   - |string|
+   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z) in [−1, 1]; :monosp:`height`, which
+     gives normals ∝ (−∂h/∂x, −∂h/∂y, 1); or :monosp:`auto`, a height where there is one channel or
+     all channels are equal. Files of unsigned integers are decoded from [0, 1].
+     (Default: :monosp:`auto`)
+
+ * - height_scale
+   - |float|
+   - Texels per unit of height. (Default: 1)
+
+ * - wrap_mode
+   - |string|
+   - What lies beyond the map's border: :monosp:`repeat`, :monosp:`mirror` or :monosp:`clamp`.
+     (Default: :monosp:`repeat`)
+
+ * - to_uv
+   - |transform|
+   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
+   - |exposed|
+
+ * - method
+   - |string|
+   - The filter: :monosp:`toksvig`, :monosp:`lean`, :monosp:`clean`, :monosp:`leadr` or
+     :monosp:`variance`, see below. (Default: :monosp:`lean`)
+
+ * - alpha
+   - |float|
+   - Roughness of the material itself, > 0; up to 1 for :monosp:`toksvig`. (Default: 0.05)
+   - |exposed|, |differentiable|
+
+ * - distribution
+   - |string|
+   - Shape of the lobe: :monosp:`beckmann`, or for :monosp:`toksvig` and :monosp:`variance` also
+     :monosp:`ggx`. (Default: :monosp:`beckmann`)
+
+ * - max_anisotropy
+   - |float|
+   - Ratio of a footprint's axes, ≥ 1, beyond which it is widened along the minor axis. The number
+     of lookups along the major axis grows with the ratio; 1 makes all footprints round.
+     (Default: 16)
+
+ * - masking
+   - |string|
+   - Masking and shadowing: :monosp:`smith`, by the facets of the lobe, or :monosp:`none`. Part of
+     the method for :monosp:`leadr`, which takes no other. (Default: :monosp:`smith`)
+
+ * - height_correlated
+   - |bool|
+   - Whether masking and shadowing are correlated by height, rather than independent.
+     (Default: |true|)
+
+ * - footprint_sigma
+   - |float|
+   - Standard deviation of the footprint, in pixels. (Default: 0.5)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - pixel_spread
+   - |float|
+   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
+     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
+     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - material
+   - |string|
+   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
+
+ * - eta, k
+   - |spectrum| or |texture|
+   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
+     (Default: 0 and 1 where only the other is given)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - int_ior, ext_ior
+   - |float| or |string|
+   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
+     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
+     :monosp:`bk7` and :monosp:`air` where only the other is given)
+
+ * - specular_reflectance
+   - |spectrum| or |texture|
+   - Factor on the reflection, in [0, 1]. (Default: 1)
+   - |exposed|, |differentiable|
+
+A normal map seen from afar, filtered as games and films do it today: one smooth lobe per footprint.
+Where a pixel covers many thousands of bumps this is all there is to see, at a small part of the
+price of the glints' methods; nearer by it is the baseline that they are measured against. All
+methods average moments of the normals over the whole footprint, however stretched or rotated, from
+a MIP chain that holds no more than the method needs:
+
+.. list-table::
+    :widths: 15 85
+
+    * - :monosp:`toksvig`
+      - From the length of the mean normal, isotropic :cite:`Toksvig2005`
+    * - :monosp:`lean`
+      - Mean and covariance of the slopes, an off-centred anisotropic lobe :cite:`Olano2010LEAN`
+    * - :monosp:`clean`
+      - As LEAN, with one variance for all directions :cite:`Baker2011CLEAN`
+    * - :monosp:`leadr`
+      - LEAN, with the masking and the projected area of its lobe :cite:`Dupuy2013LEADR`: never
+        reflects more light than arrives
+    * - :monosp:`variance`
+      - Roughness along u and v per MIP texel, from the variance lost there; what texture filtering
+        between texels loses is not counted :cite:`RTR4`, section 9.13.1
+
+The mean normal of a footprint moves the lobe off the geometric normal. Normals are drawn from those
+that the viewer sees.
+
+The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
+inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
+coordinates.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: lst-glint_filtered
+
+        <bsdf type="glint_filtered">
+            <string name="filename" value="scratches.exr"/>
+            <string name="method" value="leadr"/>
+            <float name="alpha" value="0.02"/>
+            <string name="material" value="Al"/>
+        </bsdf>
+
+    .. code-tab:: python
+
+        'type': 'glint_filtered',
+        'filename': 'scratches.exr',
+        'method': 'leadr',
+        'alpha': 0.02,
+        'material': 'Al'
+
+Reference: Tomas Akenine-Möller et al., "Real-Time Rendering", 4th edition, section 9.13.1
+(:cite:`RTR4`).
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from glintbsdf.bsdf import GlintBSDF
+from glintbsdf.errors import check
+from glintbsdf.footprint import Footprint
+from glintbsdf.parameters import Parameters
+from glintbsdf.pndf.filtered import METHODS, Filtered, LobeMasking, VisibleNormals
+from glintbsdf.slope_lobe import DISTRIBUTIONS
+
+
+class GlintFiltered(GlintBSDF):
+    """The plugin ``glint_filtered``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        parameters = Parameters(props)
+        method = parameters.choice("method", "lean", tuple(METHODS))
+        self.pndf = Filtered(
+            parameters.normal_map(),
+            method=method,
+            alpha=parameters.number("alpha", 0.05),
+            distribution=parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
+            max_anisotropy=parameters.number("max_anisotropy", 16.0, minimum=1.0),
+            owner=self.owner,
+        )
+        masking = parameters.choice("masking", "smith", ("smith", "none"))
+        check(
+            masking == "smith" or method != "leadr",
+            self.owner,
+            "masking",
+            "smith for leadr, whose part it is",
+            masking,
+        )
+        height_correlated = parameters.boolean("height_correlated", True)
+        self.masking = None
+        if masking == "smith":
+            self.masking = LobeMasking(self.pndf, height_correlated, projection=method == "leadr")
+
+    def normals(self) -> VisibleNormals:
+        return VisibleNormals(self.pndf)
+
+    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
+        return self.pndf.with_lobe(super().footprint(si))
+
+
+mi.register_bsdf("glint_filtered", lambda props: GlintFiltered(props))

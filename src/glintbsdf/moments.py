@@ -1,0 +1,398 @@
+"""MIP chains of a map's moments, and their averages under a Gaussian footprint.
+
+A filter of normal maps keeps a few numbers of the normals, averages them over the footprint, and
+makes a lobe of the averages. Here is the averaging, whatever the numbers are.
+
+The footprint is a Gaussian, so the chain is one of Gaussians as well: level 0 holds the texels,
+level ℓ ≥ 1 the averages over an isotropic Gaussian of standard deviation :func:`level_sigma` (ℓ),
+of the continuous map, triangles between texel centres, not of its texels alone. A footprint that
+is a level's Gaussian around one of its texels gets exact averages; one between is a mixture of two
+levels with the footprint's variance. Stretched footprints are sums of such lookups along the major
+axis, as texture hardware does (Heckbert, "Fundamentals of Texture Mapping and Image Warping",
+1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping", SIGGRAPH
+1999).
+
+Positions are in texels: texel (row i, column j) has its centre at (j, i).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, floor, log2, sqrt
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from .kernels import TexelKernel
+from .lattice import floor_int
+
+#: Standard deviation of a level over that of the one before.
+RATIO = sqrt(2)
+
+#: Spacing of a level's samples over its standard deviation, at most, where that exceeds a texel.
+SPACING = 0.75
+
+#: Level texels beyond the border of a map that is not periodic: there its border has faded out.
+BORDER = 6
+
+#: Where a Gaussian that makes a level from a finer one is cut, in standard deviations.
+CUT = 4.0
+
+#: Distance of two lookups along the major axis, at most, in standard deviations of a lookup (a sum
+#: of Gaussians ripples by 5 % at 2.3), and how far they reach, in standard deviations of the whole.
+STEP, REACH = 2.3, 2.3
+
+#: The same reach where there is one lookup on either side of the middle: nearest to the variance.
+REACH_OF_ONE = sqrt(3)
+
+#: Footprints whose major axis has a variance of 1 + ROUND² minor ones at most count as round.
+ROUND = 0.5
+
+#: No lookup is narrower than this (standard deviation, texels): the texels are interpolated.
+SIGMA_LOOKUP = 0.5
+
+#: Keeps the derivative of a root finite where a footprint is round (texels⁴).
+TINY = 1e-12
+
+
+def level_sigma(level: int) -> float:
+    """Standard deviation of the Gaussian of a level ≥ 1, texels."""
+    return RATIO ** (level - 1)
+
+
+# ------------------------------------------------------------------------------------------------
+#  Building
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Axis:
+    """``count`` samples at ``origin + k spacing`` (texels) along one axis.
+
+    Beyond them they repeat, or the outermost go on for ever.
+    """
+
+    count: int
+    origin: float
+    spacing: float
+    periodic: bool
+
+    def wrapped(self, index):
+        """The sample that stands at any ``mi.Int`` index."""
+        if self.periodic:
+            turns = floor_int((mi.Float(index) + 0.5) * (1 / self.count))
+            return mi.UInt32(index - turns * self.count)
+        return mi.UInt32(dr.clip(index, 0, self.count - 1))
+
+
+def level_axis(texels: int, spacing: float, periodic: bool) -> Axis:
+    """The samples of a level with at most this spacing along an axis of ``texels``."""
+    if periodic:
+        count = ceil(texels / spacing)
+        spacing = texels / count
+        return Axis(count, spacing / 2 - 0.5, spacing, True)
+    count = ceil(texels / spacing) + 2 * BORDER
+    return Axis(count, (0.5 - BORDER) * spacing - 0.5, spacing, False)
+
+
+def smooth(
+    channels: list, axes: tuple[Axis, Axis], along: int, target: Axis, variance: float
+) -> list:
+    """Average samples over a Gaussian along one axis, and take new samples of the result.
+
+    Args:
+        channels: arrays (``mi.Float``) of rows × columns samples.
+        axes: of rows and of columns.
+        along (int): which of them.
+        target (Axis): where to sample.
+        variance (float): of the Gaussian, texels².
+    """
+    source, other = axes[along], axes[1 - along]
+    sample = dr.arange(mi.UInt32, target.count * other.count)
+    columns = target.count if along == 1 else other.count
+    row, column = sample // columns, sample % columns
+    index, kept = (column, row) if along == 1 else (row, column)
+
+    # Opaque, so that one kernel serves many levels.
+    step = dr.opaque(mi.Float, target.spacing / source.spacing)
+    first = dr.opaque(mi.Float, (target.origin - source.origin) / source.spacing)
+    sharpness = dr.opaque(mi.Float, source.spacing**2 / (2 * variance))
+    place = dr.fma(mi.Float(index), step, first)
+    nearest = floor_int(place + 0.5)
+    totals, weights = [mi.Float(0) for _ in channels], mi.Float(0)
+    reach = ceil(CUT * sqrt(variance) / source.spacing)
+    for offset in range(-reach, reach + 1):
+        distance = mi.Float(nearest + offset) - place
+        weight = dr.exp(-sharpness * distance * distance)
+        taken = source.wrapped(nearest + offset)
+        position = kept * source.count + taken if along == 1 else taken * other.count + kept
+        totals = [
+            dr.fma(weight, dr.gather(mi.Float, channel, position), total)
+            for channel, total in zip(channels, totals, strict=True)
+        ]
+        weights += weight
+    return [total / weights for total in totals]
+
+
+def all_texels(normals, texels: tuple[Axis, Axis], axes: tuple[Axis, Axis]):
+    """The normals (``mi.Vector2f``) at the samples of ``axes``, which are texels."""
+    index = dr.arange(mi.UInt32, axes[0].count * axes[1].count)
+    row, column = (
+        mi.Int(i) + int(axis.origin)
+        for i, axis in zip((index // axes[1].count, index % axes[1].count), axes, strict=True)
+    )
+    index = texels[0].wrapped(row) * texels[1].count + texels[1].wrapped(column)
+    return dr.gather(mi.Vector2f, normals, index)
+
+
+def quad_averages(moments: Callable, normals, axes: tuple[Axis, Axis]):
+    """Moments averaged over each quad between four texels, and the axes of the quads' centres.
+
+    Over the two triangles of a quad the projected normal is linear. The rule of the three midpoints
+    of edges integrates its quadratic polynomials exactly, and slopes are almost linear in it.
+    """
+    # Where the map is not periodic there is a constant quad beyond each border.
+    quads = tuple(
+        Axis(axis.count, 0.5, 1.0, True)
+        if axis.periodic
+        else Axis(axis.count + 1, -0.5, 1.0, False)
+        for axis in axes
+    )
+    index = dr.arange(mi.UInt32, quads[0].count * quads[1].count)
+    row, column = (
+        mi.Int(i) if axis.periodic else mi.Int(i) - 1
+        for i, axis in zip((index // quads[1].count, index % quads[1].count), axes, strict=True)
+    )
+    n0, n1, n2, n3 = (
+        dr.gather(
+            mi.Vector2f,
+            normals,
+            axes[0].wrapped(row + i) * axes[1].count + axes[1].wrapped(column + j),
+        )
+        for i in (0, 1)
+        for j in (0, 1)
+    )
+    edges = ((n0, n1, 1), (n0, n2, 1), (n1, n2, 2), (n1, n3, 1), (n2, n3, 1))
+    parts = [[weight / 6 * x for x in moments(0.5 * (a + b))] for a, b, weight in edges]
+    return [sum(part[1:], part[0]) for part in zip(*parts, strict=True)], quads
+
+
+class Grid(NamedTuple):
+    """Where a level's samples are: its first, samples per texel, their number and its inverse, all
+    for x and y; the level's variance (texels²), and half of the squared spacing."""
+
+    offset: mi.UInt32
+    scale: mi.Vector2f
+    count: mi.Vector2f
+    inverse_count: mi.Vector2f
+    variance: mi.Float
+    half_square: mi.Vector2f
+
+
+def principal_axes(kernel: TexelKernel):
+    """Unit vector of the footprint's major axis; variances (texels²) along major and minor axis."""
+    variance_u, variance_v = dr.square(kernel.sigma_u), dr.square(kernel.sigma_v)
+    covariance = kernel.shear * variance_v
+    mean, difference = 0.5 * (variance_u + variance_v), 0.5 * (variance_u - variance_v)
+    radius = dr.sqrt(dr.fma(difference, difference, dr.fma(covariance, covariance, TINY)))
+    # The eigenvector, from the row of Σ − λ₂ I that does not cancel.
+    axis = dr.select(
+        difference >= 0,
+        mi.Vector2f(difference + radius, covariance),
+        mi.Vector2f(covariance, radius - difference),
+    )
+    major = mean + radius
+    # The smaller eigenvalue from the determinant, whose digits the kernel has kept.
+    minor = dr.square(kernel.sigma_u_given_v * kernel.sigma_v) / major
+    return axis * dr.rsqrt(dr.squared_norm(axis)), major, minor
+
+
+def taps(variance_major, variance_minor, variance):
+    """How to make a stretched Gaussian of round ones of at least this variance.
+
+    Returns the variance of a round one, the distance between two, how many there are on either side
+    of the middle, and the ``s`` of their weights ``exp(−s k²)``.
+    """
+    spread = dr.sqrt(dr.maximum(variance_major - variance, 0))
+    sigma = dr.maximum(dr.sqrt(variance), SIGMA_LOOKUP)
+    one, many = spread > ROUND * sigma, REACH_OF_ONE * spread > STEP * sigma
+    steps = dr.select(many, dr.ceil(REACH / STEP * spread / sigma), dr.select(one, 1, 0))
+    reach = dr.select(many, REACH / dr.maximum(steps, 1), REACH_OF_ONE)
+    steps = dr.detach(steps)  # constant but for jumps, and a loop counts to it
+    variance = dr.select(one, variance, 0.5 * (variance_major + variance_minor))
+    return variance, reach * spread, steps, 0.5 * dr.square(reach)
+
+
+class MomentPyramid:
+    """The MIP chain of some moments of a map.
+
+    Args:
+        data (mi.TensorXf): projected normals, H×W×2. Derivatives flow through it.
+        wrap_mode (str): what lies beyond the map's border.
+        moments: function of projected normals (``mi.Vector2f``) that returns a list of ``mi.Float``
+            whose averages are wanted, any number of them.
+        finish: function from the averages of a sample of the chain to what is stored there and
+            interpolated; by default the averages themselves.
+        max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
+
+    Attributes:
+        nbytes (int): memory of the chain.
+    """
+
+    def __init__(
+        self,
+        data: mi.TensorXf,
+        wrap_mode: str,
+        moments: Callable,
+        finish: Callable = lambda averages: averages,
+        max_anisotropy: float = 16.0,
+    ) -> None:
+        self.height, self.width, _ = data.shape
+        self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
+        self.periodic = wrap_mode != "clamp"
+        normals, rows, columns = self.one_period(data)
+        texels = Axis(rows, 0.0, 1.0, self.periodic), Axis(columns, 0.0, 1.0, self.periodic)
+        axes = tuple(level_axis(n, 1.0, self.periodic) for n in (rows, columns))
+        stored, shapes = [finish(moments(all_texels(normals, texels, axes)))], [axes]
+        level, axes = quad_averages(moments, normals, texels)
+        variance = 1 / 12  # of a quad, along each axis
+        self.top = 0
+        while len(shapes) == 1 or max(rows, columns) > level_sigma(self.top):
+            self.top += 1
+            sigma = level_sigma(self.top)
+            spacing = 2.0 ** max(0, floor(log2(sigma * SPACING)))
+            target = tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
+            for along in (0, 1):
+                level = smooth(level, axes, along, target[along], sigma**2 - variance)
+                axes = (target[0], axes[1]) if along == 0 else target
+                dr.eval(level)
+            variance = sigma**2
+            stored.append(finish(level))
+            shapes.append(axes)
+        self.store(stored, shapes)
+
+    def one_period(self, data):
+        """Projected normals, rows and columns of the map, or of the period of a mirrored one."""
+        if self.wrap_mode != "mirror":
+            return data.array, self.height, self.width
+        index = dr.arange(mi.UInt32, 4 * self.height * self.width)
+        row, column = index // (2 * self.width), index % (2 * self.width)
+        row = dr.minimum(row, 2 * self.height - 1 - row)
+        column = dr.minimum(column, 2 * self.width - 1 - column)
+        mirrored = dr.gather(mi.Vector2f, data.array, row * self.width + column)
+        return dr.ravel(mirrored), 2 * self.height, 2 * self.width
+
+    def store(self, levels: list[list], shapes: list[tuple[Axis, Axis]]) -> None:
+        """Lay the levels out one after the other, as records of four numbers, and of one each."""
+        channels = [dr.concat(parts) for parts in zip(*levels, strict=True)]
+        dr.eval(channels)
+        self.channels = len(channels)
+        zero = dr.zeros(mi.Float, dr.width(channels[0]))
+        self.records = []
+        while len(channels) > 1:
+            group, channels = channels[:4], channels[4:]
+            group = group + [zero] * (4 - len(group))
+            self.records.append(dr.ravel(mi.Vector4f(group)))
+        self.single = channels[0] if channels else None
+        sizes = [rows.count * columns.count for rows, columns in shapes]
+        self.offsets = mi.UInt32([sum(sizes[:k]) for k in range(len(sizes))])
+        # index = (position + 1/2) / spacing − 1/2 (+ border), for every level; see level_axis.
+        self.grids = dr.ravel(
+            mi.Vector4f(
+                [
+                    mi.Float([1 / columns.spacing for _, columns in shapes]),
+                    mi.Float([1 / rows.spacing for rows, _ in shapes]),
+                    mi.Float([columns.count for _, columns in shapes]),
+                    mi.Float([rows.count for rows, _ in shapes]),
+                ]
+            )
+        )
+        dr.eval(self.records, self.single, self.offsets, self.grids)
+        self.nbytes = 4 * sum(sizes) * (4 * len(self.records) + (self.single is not None))
+
+    # --------------------------------------------------------------------------------------------
+    #  Lookup
+    # --------------------------------------------------------------------------------------------
+
+    def average(self, footprint) -> list:
+        """What is stored, averaged over a footprint: one ``mi.Float`` per channel.
+
+        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
+        """
+        kernel = TexelKernel("gaussian", footprint, self.height, self.width, self.wrap_mode)
+        major, variance_major, variance_minor = principal_axes(kernel)
+        variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
+        variance, step, steps, sharpness = taps(variance_major, variance_minor, variance)
+        # The coarsest level that is fine enough, wherever the lookup falls between its samples.
+        level = dr.clip(
+            dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 4))) / (2 * log2(RATIO))) + 1,
+            0,
+            self.top - 1,
+        )
+        grids = [self.grid(level), self.grid(level + 1)]
+        step = major * step
+
+        # What derivatives flow through is part of the loop's state: they do not find it otherwise.
+        def body(k, mean, step, variance, sharpness, weights, *totals):
+            weight = dr.exp(-sharpness * k * k)
+            values = self.lookup(mean + k * step, variance, grids)
+            totals = [dr.fma(weight, x, total) for x, total in zip(values, totals, strict=True)]
+            return k + 1, mean, step, variance, sharpness, weights + weight, *totals
+
+        zeros = [mi.Float(0) for _ in range(self.channels)]
+        weights, *totals = dr.while_loop(
+            (-steps, kernel.mean, step, variance, sharpness, mi.Float(0), *zeros),
+            lambda k, *_: k <= steps,
+            body,
+            max_iterations=-1,
+            label="taps",
+        )[5:]
+        return [total / weights for total in totals]
+
+    def grid(self, level) -> Grid:
+        """The samples of a level (``mi.Float``)."""
+        index = mi.UInt32(level)
+        scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
+        variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
+        return Grid(
+            dr.gather(mi.UInt32, self.offsets, index),
+            mi.Vector2f(scale_x, scale_y),
+            mi.Vector2f(columns, rows),
+            mi.Vector2f(dr.rcp(columns), dr.rcp(rows)),
+            variance,
+            mi.Vector2f(0.5 * dr.rcp(dr.square(scale_x)), 0.5 * dr.rcp(dr.square(scale_y))),
+        )
+
+    def lookup(self, position, variance, grids) -> list:
+        """The mixture, at a position, of a level and the next that has this variance."""
+        (fine, fine_variance), (coarse, coarse_variance) = (
+            self.bilinear(position, grid) for grid in grids
+        )
+        weight = dr.clip((variance - fine_variance) * dr.rcp(coarse_variance - fine_variance), 0, 1)
+        return [dr.lerp(a, b, weight) for a, b in zip(fine, coarse, strict=True)]
+
+    def bilinear(self, position, grid: Grid):
+        """What a level says at a position, and the variance (texels²) of the kernel there."""
+        count = grid.count
+        place = (position + 0.5) * grid.scale + (-0.5 if self.periodic else BORDER - 0.5)
+        corner = dr.floor(place)
+        f = place - corner
+        if self.periodic:
+            first = corner - count * dr.floor((corner + 0.5) * grid.inverse_count)
+            second = dr.select(first + 1 < count, first + 1, 0)
+        else:
+            first, second = (dr.clip(corner + k, 0, count - 1) for k in (0, 1))
+        columns = mi.UInt32(count.x)
+        rows = [grid.offset + mi.UInt32(y) * columns for y in (first.y, second.y)]
+        index = [row + mi.UInt32(x) for row in rows for x in (first.x, second.x)]
+        weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
+        averages = []
+        for kind, records in [(mi.Vector4f, x) for x in self.records] + (
+            [] if self.single is None else [(mi.Float, self.single)]
+        ):
+            value = sum(dr.gather(kind, records, i) * w for i, w in zip(index, weight, strict=True))
+            averages += list(value) if kind is mi.Vector4f else [value]
+        # Between two samples, weighed 1 − f and f, interpolation adds the variance f (1 − f) h².
+        return averages[: self.channels], grid.variance + dr.dot(f * (1 - f), grid.half_square)

@@ -1,0 +1,378 @@
+"""The smooth filters of normal maps that are in use: one lobe in place of the P-NDF.
+
+Akenine-Möller et al., "Real-Time Rendering" (RTR), 4th edition, 2018, section 9.13.1. Each filter
+keeps some moments of the normals under the footprint (:mod:`glintbsdf.moments`) and turns their
+averages, with the roughness α of the material between the texels' normals, into a lobe
+(:mod:`glintbsdf.slope_lobe`). Where a paper speaks of the variance σ² of slopes, α² = 2σ².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import check, check_choice
+from ..footprint import Footprint
+from ..microfacet import SmithMasking
+from ..moments import MomentPyramid
+from ..normalmap import MAX_SLOPE, NormalMap, check_texels
+from ..slope_lobe import DISTRIBUTIONS, SlopeLobe
+
+# ------------------------------------------------------------------------------------------------
+#  Moments: functions of projected normals
+# ------------------------------------------------------------------------------------------------
+
+
+def slope(s):
+    """``m_xy / m_z`` of the projected normal s."""
+    return s * dr.rsqrt(1 - dr.squared_norm(s))
+
+
+def lean_moments(s) -> list:
+    """Olano and Baker 2010, Eq. 6: slopes, and the products of slopes (x², y², xy)."""
+    b = slope(s)
+    return [b.x, b.y, b.x * b.x, b.y * b.y, b.x * b.y]
+
+
+def clean_moments(s) -> list:
+    """Baker, "Spectacular Specular: LEAN and CLEAN Specular Highlights", GDC 2011: slopes, and half
+    of their squared length."""
+    b = slope(s)
+    return [b.x, b.y, 0.5 * dr.squared_norm(b)]
+
+
+def variance_moments(s) -> list:
+    """Slopes and their squares."""
+    return lean_moments(s)[:4]
+
+
+def normal_moments(s) -> list:
+    """The unit normal, as (x, y, 1 − z): near z = 1 no digit is lost."""
+    squared = dr.squared_norm(s)
+    return [s.x, s.y, squared / (1 + dr.sqrt(1 - squared))]
+
+
+# ------------------------------------------------------------------------------------------------
+#  Lobes: functions of averages of moments, α² and the distribution
+# ------------------------------------------------------------------------------------------------
+
+
+def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """LEAN (Olano and Baker 2010, Eq. 5, 8): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``."""
+    x, y, xx, yy, xy = averages
+    variance_u, variance_v = positive(xx - x * x), positive(yy - y * y)
+    covariance = xy - x * y
+    uu, vv, uv = alpha_squared + 2 * variance_u, alpha_squared + 2 * variance_v, 2 * covariance
+    # |Ω|, with the determinant of the covariance kept from falling below zero by rounding.
+    determinant = alpha_squared * (alpha_squared + 2 * (variance_u + variance_v)) + 4 * positive(
+        variance_u * variance_v - covariance * covariance
+    )
+    return SlopeLobe(mi.Vector2f(x, y), uu, vv, uv, determinant, distribution)
+
+
+def clean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """CLEAN (Baker 2011): as LEAN, with the mean of both variances along every direction."""
+    x, y, half_square = averages
+    variance = positive(half_square - 0.5 * (x * x + y * y))
+    return round_lobe(mi.Vector2f(x, y), alpha_squared + 2 * variance, distribution)
+
+
+def variance_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """Variance mapping (RTR 9.13.1; Hill, SIGGRAPH course 2012): ``α'² = α² + 2 variance`` along u
+    and v.
+
+    The variances are those that :func:`store_variance` has put into the map's MIP levels: what lies
+    between samples of the map, and between lookups, is not counted.
+    """
+    x, y, variance_u, variance_v = averages
+    uu, vv = alpha_squared + 2 * variance_u, alpha_squared + 2 * variance_v
+    return SlopeLobe(mi.Vector2f(x, y), uu, vv, mi.Float(0), uu * vv, distribution)
+
+
+def store_variance(averages: list) -> list:
+    """The means and variances of slopes from their means and mean squares."""
+    x, y, xx, yy = averages
+    return [x, y, positive(xx - x * x), positive(yy - y * y)]
+
+
+def toksvig_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """Toksvig's (2005), RTR Eq. 9.76: the shorter the mean normal, of length l, the rougher.
+
+    ``α_p' = l α_p / (l + α_p (1 − l))`` for the exponent of Blinn and Phong, which stands for a
+    roughness by ``α_p = 2/α² − 2`` (Walter et al. 2007); RTR uses the same for GGX. Written for α:
+    with k = (1 − l)/l, ``α'² = (α² + 2k (1 − α²)) / (1 + 2k (1 − α²))``.
+    """
+    x, y, shortfall = averages  # of z below 1
+    length = dr.sqrt(x * x + y * y + dr.square(1 - shortfall))
+    # 1 − l, from 1 − l², whose terms are all small where l is near 1.
+    k = positive(2 * shortfall - shortfall * shortfall - x * x - y * y) / ((1 + length) * length)
+    widened = 2 * k * (1 - alpha_squared)
+    alpha_squared = (alpha_squared + widened) / (1 + widened)
+    return lobe_about_normal(mi.Vector2f(x, y) / (1 - shortfall), alpha_squared, distribution)
+
+
+def lobe_about_normal(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """The lobe of an isotropic roughness about a normal of slope b, rather than about the vertical.
+
+    The tangent of a rotation takes a roughness from the plane across that normal to the plane of
+    slopes: ``Ω = α² (1 + |b|²) (I + b bᵀ)``, wider along b than across.
+    """
+    stretch = 1 + dr.squared_norm(mean)
+    scale = alpha_squared * stretch
+    uu, vv = scale * (1 + mean.x * mean.x), scale * (1 + mean.y * mean.y)
+    return SlopeLobe(mean, uu, vv, scale * mean.x * mean.y, scale * scale * stretch, distribution)
+
+
+def round_lobe(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """The lobe of an isotropic roughness."""
+    zero = mi.Float(0)
+    return SlopeLobe(
+        mean, alpha_squared, alpha_squared, zero, dr.square(alpha_squared), distribution
+    )
+
+
+def positive(x):
+    """``x``, or 0 where rounding has made it negative."""
+    return dr.maximum(x, 0)
+
+
+# ------------------------------------------------------------------------------------------------
+#  The methods
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Method:
+    """What a filter averages, what it stores of that, and the lobe it makes of what is stored."""
+
+    moments: Callable
+    lobe: Callable
+    distributions: tuple[str, ...] = ("beckmann",)
+    store: Callable = lambda averages: averages
+
+
+#: Distributions are those that a method's authors, or RTR, define it for.
+METHODS = {
+    "toksvig": Method(normal_moments, toksvig_lobe, DISTRIBUTIONS),
+    "lean": Method(lean_moments, lean_lobe),
+    "clean": Method(clean_moments, clean_lobe),
+    "leadr": Method(lean_moments, lean_lobe),  # LEAN with masking and projection
+    "variance": Method(variance_moments, variance_lobe, DISTRIBUTIONS, store_variance),
+}
+
+
+class LobeFootprint(Footprint):
+    """A footprint with the lobe of the normals in it, for those who ask for the lobe repeatedly."""
+
+    def __init__(self, footprint: Footprint, lobe: SlopeLobe) -> None:
+        super().__init__(footprint.uv, footprint.du, footprint.dv)
+        self.lobe = lobe
+
+
+class Filtered:
+    """A P-NDF that is one lobe, by one of the filters of RTR 9.13.1.
+
+    Belongs to the variant of Mitsuba that is active when it is made.
+
+    Args:
+        normal_map (NormalMap): the map; slopes up to 1000.
+        method (str): one of :data:`METHODS`.
+        alpha (float): roughness of the material, > 0; Toksvig's formula ends at 1.
+        distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
+        max_anisotropy (float): ≥ 1, see :class:`~glintbsdf.moments.MomentPyramid`.
+        owner (str): whom errors name, usually the plugin.
+
+    Attributes:
+        data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
+            change of its values, :meth:`parameters_changed` rebuilds the MIP chain.
+        alpha (mi.Float): the roughness.
+
+    Raises :class:`~glintbsdf.errors.ParameterError`.
+    """
+
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        method: str = "lean",
+        alpha: float = 0.05,
+        distribution: str = "beckmann",
+        max_anisotropy: float = 16.0,
+        owner: str = "Filtered",
+    ) -> None:
+        check_choice(owner, "method", method, tuple(METHODS))
+        check_choice(owner, "distribution", distribution, DISTRIBUTIONS)
+        self.method = METHODS[method]
+        check(
+            distribution in self.method.distributions,
+            owner,
+            "distribution",
+            f"{' or '.join(self.method.distributions)}, for which alone {method} is defined",
+            distribution,
+        )
+        check(max_anisotropy >= 1, owner, "max_anisotropy", "a number ≥ 1", max_anisotropy)
+        self.name, self.distribution, self.owner = method, distribution, owner
+        self.max_anisotropy, self.wrap_mode = float(max_anisotropy), normal_map.wrap_mode
+        self.alpha = mi.Float(alpha)
+        self.check_alpha()
+        self.data = mi.TensorXf(normal_map.normals)
+        self.build(normal_map)
+
+    def build(self, normal_map: NormalMap) -> None:
+        """Check the slopes, and make the MIP chain of ``self.data``."""
+        z_squared = 1 - (normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
+        check_texels(
+            self.owner,
+            "data",
+            f"a map with slopes up to {MAX_SLOPE}",
+            {"steeper": z_squared * (1 + MAX_SLOPE**2) < 1},
+        )
+        self.pyramid = MomentPyramid(
+            self.data, self.wrap_mode, self.method.moments, self.method.store, self.max_anisotropy
+        )
+
+    def check_alpha(self) -> None:
+        """Raise unless the roughness is in the method's range."""
+        limit = 1 if self.name == "toksvig" else inf
+        check(
+            dr.all(dr.isfinite(self.alpha) & (self.alpha > 0) & (self.alpha <= limit)),
+            self.owner,
+            "alpha",
+            "a finite number > 0" + (" and ≤ 1" if limit == 1 else ""),
+            self.alpha[0],
+        )
+
+    def lobe(self, footprint: Footprint) -> SlopeLobe:
+        """The lobe of a footprint, given in the UV space of the map."""
+        if isinstance(footprint, LobeFootprint):
+            return footprint.lobe
+        averages = self.pyramid.average(footprint)
+        return self.method.lobe(averages, dr.square(self.alpha), self.distribution)
+
+    def with_lobe(self, footprint: Footprint) -> LobeFootprint:
+        """The footprint, with its lobe."""
+        return LobeFootprint(footprint, self.lobe(footprint))
+
+    def eval(self, m: mi.Vector2f, footprint: Footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk; 0 outside of it."""
+        return dr.select(active, self.lobe(footprint).eval(m), 0)
+
+    def sample(
+        self,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: bool | mi.Bool = True,
+    ) -> mi.Vector2f:
+        """Draw a projected normal with density D: the normals visible from straight above."""
+        return self.lobe(footprint).sample_visible(mi.Vector3f(0, 0, 1), sample1, sample2).xy
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("data", self.data, mi.ParamFlags.Differentiable)
+        callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check what has changed, and rebuild. Derivatives keep flowing."""
+        self.check_alpha()
+        if not keys or "data" in keys:
+            self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the MIP chain, bytes."""
+        return self.pyramid.nbytes
+
+    def __repr__(self) -> str:
+        height, width, _ = self.data.shape
+        return (
+            f"Filtered[{self.name}, {self.distribution}, alpha={self.alpha[0]:g}, "
+            f"{width}×{height} texels, {self.wrap_mode}, {self.nbytes / 2**20:.1f} MiB]"
+        )
+
+
+# ------------------------------------------------------------------------------------------------
+#  In the microfacet frame
+# ------------------------------------------------------------------------------------------------
+
+
+class VisibleNormals:
+    """Draws from a lobe's normals those that the viewer sees; see ``microfacet.PndfNormals``.
+
+    Args:
+        pndf (Filtered): whose lobe.
+    """
+
+    def __init__(self, pndf: Filtered) -> None:
+        self.pndf = pndf
+
+    def sample(
+        self,
+        wi: mi.Vector3f,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool,
+    ) -> mi.Vector3f:
+        """A unit normal for the view from ``wi``."""
+        return self.pndf.lobe(footprint).sample_visible(wi, sample1, sample2)
+
+    def pdf(
+        self,
+        wi: mi.Vector3f,
+        m: mi.Vector3f,
+        density: mi.Float,
+        footprint: Footprint,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """Density of ``m`` per solid angle, given ``density``, which is D(m)."""
+        return self.pndf.lobe(footprint).visible_pdf(wi, m, density)
+
+
+class LobeMasking(SmithMasking):
+    """Smith's masking and shadowing by the facets of a lobe about its mean facet.
+
+    ``Λ = P/A − 1`` with A the area of the mean facet seen, P that of all facets that face the
+    direction (``slope_lobe.py``); 0 where the mean facet faces away. With ``projection`` the
+    reflection is that of the mean facet, not of the geometric surface: ``cosθ_i`` in the
+    denominator of the BRDF becomes A (Dupuy et al. 2013, section 3). No more light is reflected
+    then than arrives, whatever the mean slope.
+
+    Args:
+        pndf (Filtered): whose lobe.
+        height_correlated: see :class:`SmithMasking`.
+        projection (bool): LEADR's.
+    """
+
+    def __init__(
+        self, pndf: Filtered, height_correlated: bool = True, projection: bool = False
+    ) -> None:
+        super().__init__(height_correlated)
+        self.pndf, self.projection = pndf, projection
+
+    def smith_lambda(self, w: mi.Vector3f, footprint: Footprint, active: mi.Bool) -> mi.Float:
+        lobe = self.pndf.lobe(footprint)
+        mean = lobe.mean_cosine(w)
+        facing = mean > 0
+        ratio = lobe.visible_area(w) / dr.select(facing, mean, 1)
+        return dr.select(facing, dr.maximum(ratio - 1, 0), 0)
+
+    def eval(
+        self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float:
+        lobe = self.pndf.lobe(footprint)
+        mean_i, mean_o = lobe.mean_cosine(wi), lobe.mean_cosine(wo)
+        facing = (mean_i > 0) & (mean_o > 0)
+        value = super().eval(wi, wo, footprint, active)
+        if self.projection:
+            value = value * wi.z / dr.select(facing, mean_i, 1)
+        return dr.select(facing, value, 0)
+
+    def __repr__(self) -> str:
+        return (
+            f"smith[height_correlated = {self.height_correlated}"
+            f"{', projection' if self.projection else ''}]"
+        )
