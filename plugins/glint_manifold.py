@@ -55,8 +55,10 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
  * - threshold
    - |float|
-   - The threshold τ of the paper's hierarchy. Only 0, exact evaluation, is supported so far.
-     (Default: 0)
+   - The threshold τ of the paper's hierarchy of clusters: a cluster of triangles takes the place of
+     those of the map where the integral of its squared error, as a distance in texels, is at most
+     τ times the footprint's radii :math:`r_x r_y`. Between 1e-4 and 1e-2, say; with 0, evaluation
+     is exact. (Default: 0)
 
  * - max_error
    - |float|
@@ -148,6 +150,8 @@ Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), s
 
 from __future__ import annotations
 
+from functools import partial
+
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
@@ -155,7 +159,7 @@ from glintbsdf.errors import check
 from glintbsdf.kernels import KERNELS
 from glintbsdf.microfacet import MapBeckmannMasking
 from glintbsdf.parameters import Parameters
-from glintbsdf.pndf import Manifold
+from glintbsdf.pndf import ClusteredManifold, Manifold
 
 
 class GlintManifold(GlintBSDF):
@@ -164,10 +168,13 @@ class GlintManifold(GlintBSDF):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
-        for name in ("threshold", "max_error"):
-            value = parameters.number(name, 0.0)
-            check(value == 0, self.owner, name, "0 (exact), as more is not yet supported", value)
-        self.pndf = Manifold(
+        threshold, max_error = (parameters.number(name, 0.0) for name in ("threshold", "max_error"))
+        check(not (threshold and max_error), self.owner, "threshold",
+              'left out where "max_error" is given', threshold)
+        check(max_error == 0, self.owner, "max_error", "0 (exact), as more is not yet supported",
+              max_error)
+        create = partial(ClusteredManifold, threshold=threshold) if threshold else Manifold
+        self.pndf = create(
             parameters.normal_map(),
             kernel=parameters.choice("kernel", "gaussian", KERNELS),
             epsilon=parameters.number("epsilon", 1e-6),

@@ -1,7 +1,8 @@
 """Estimators of the P-NDF, the distribution of normals seen through a footprint."""
 
+from .clustered import ClusteredManifold
 from .filtered import Filtered
 from .grid import Grid
 from .manifold import Manifold
 
-__all__ = ["Filtered", "Grid", "Manifold"]
+__all__ = ["ClusteredManifold", "Filtered", "Grid", "Manifold"]
