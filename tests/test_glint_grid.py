@@ -140,7 +140,8 @@ def test_weights_are_a_partition_about_the_centre(variant, stretch):
         return dr.select(active, mi.Vector3f(1, mi.Float(x) * spacing, mi.Float(y) * spacing), 0)
 
     moments = np.array(cells.sum(moments, mi.Vector3f(0), mi.Bool(True)), np.float64)
-    assert np.allclose(moments[0], 1, atol=2e-5)
+    # Rounding of the tent's integral (6e-8) over the shortest median (2e-3)
+    assert np.allclose(moments[0], 1, atol=1e-4)
     centre = 1e4 * np.array(stretch)[:, None] * np.array(footprint.uv)
     spacing = np.exp2(np.array(cells.level))
     # Both ends of a median that is not flat shift the mean across it by a fraction of a cell.

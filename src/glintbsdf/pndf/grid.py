@@ -97,7 +97,7 @@ class CoveredCells:
         size = dr.maximum(size, UV_RESOLUTION * dr.max(dr.abs(footprint.uv)) * scale)
         size = dr.clip(size, 1, limit)
         self.level = mi.Int(dr.reinterpret_array(mi.UInt32, size) >> 23) - 127  # floor(log2)
-        self.blend = size * power_of_two(-self.level) - 1
+        self.blend = dr.log2(size * power_of_two(-self.level))
 
         # The median, in stretched coordinates: p along it and q across, q = slope · p
         a, b, c = covariance(du * stretch, dv * stretch)
@@ -378,6 +378,9 @@ class Grid:
     #: Nothing is stored.
     nbytes = 0
 
+    #: How the cells of a footprint are chosen; benchmarks put other ways in its place.
+    covered_cells = CoveredCells
+
     NAMES = (
         "alpha_u",
         "alpha_v",
@@ -480,7 +483,7 @@ class Grid:
 
         ``hp``: half vector on the paraboloid map, in cells; ``p``: P(h).
         """
-        cells = CoveredCells(footprint, self.scale, self.stretch, self.max_anisotropy)
+        cells = self.covered_cells(footprint, self.scale, self.stretch, self.max_anisotropy)
         binomial = ReflectingCount(p)
 
         def fraction(x, y, level, active):
