@@ -2,7 +2,7 @@
 
 ``python benchmarks/grid_cost.py [-o RESULT.json]``
 
-A plane that fills a picture of 400², 16 samples per pixel, stock ``path``, seen along its normal and
+A plane fills a picture of 400², 16 samples per pixel, stock ``path``, seen along its normal and
 at 10° to it, from two distances. All materials render in turn within every repetition, after a
 first frame that compiles; figures are medians, and ratios are taken within a repetition. Expected:
 at most 1.5 along the normal and 3 at 10°, whatever the distance and density.
