@@ -72,67 +72,76 @@ def fit_clusters(
 
 
 def first_moments(vertices: Array, epsilon: float) -> Array:
-    """Moments of the clusters of level 1, (⌊R/2⌋, ⌊C/2⌋, 2 halves, MOMENTS)."""
+    """Moments of the clusters of level 1, (MOMENTS, 2 halves, ⌊R/2⌋, ⌊C/2⌋)."""
     rows, columns = ((n - 1) // 2 for n in vertices.shape[:2])
     step = max(1, STRIP_QUADS // (4 * max(columns, 1)))
     strips = [
         merged(quad_moments(vertices[2 * i : 2 * min(i + step, rows) + 1], epsilon))
         for i in range(0, rows, step)
     ]
-    return np.concatenate([np.empty((0, columns, 2, MOMENTS)), *strips])
+    return np.concatenate([np.empty((MOMENTS, 2, 0, columns)), *strips], axis=2)
 
 
 def quad_moments(vertices: Array, epsilon: float) -> Array:
-    """Moments of every quad, (R, C, 2 halves, MOMENTS)."""
-    n0, n1 = vertices[:-1, :-1], vertices[:-1, 1:]
-    n2, n3 = vertices[1:, :-1], vertices[1:, 1:]
-    moments = np.zeros((*n0.shape[:2], 2, MOMENTS))
+    """Moments of every quad, (MOMENTS, 2 halves, R, C)."""
+    planes = np.ascontiguousarray(np.moveaxis(vertices, -1, 0))
+    n0, n1 = planes[:, :-1, :-1], planes[:, :-1, 1:]
+    n2, n3 = planes[:, 1:, :-1], planes[:, 1:, 1:]
+    moments = np.empty((MOMENTS, 2, *n0.shape[1:]))
     for half, (a, b, c) in enumerate(((n0, n1, n2), (n3, n2, n1))):
-        det = np.cross(b - a, c - a)
-        weight = (0.5 / 3) / np.maximum(np.abs(det), epsilon)  # of a midpoint: a third of the area
-        corners = (((0, 0), a), ((1, 0), b), ((0, 1), c))
-        for k in range(3):
-            (p, n_p), (q, n_q) = corners[k], corners[k - 1]
-            x, y = (p[0] + q[0]) / 2, (p[1] + q[1]) / 2
-            x, y = (1 - x, 1 - y) if half else (x, y)
-            n = 0.5 * (n_p + n_q)
-            moments[:, :, half, :6] += weight[..., None] * [1, x, y, x * x, x * y, y * y]
-            for axis in range(2):
-                weighted = weight * n[..., axis]
-                moments[:, :, half, 6 + 3 * axis : 9 + 3 * axis] += weighted[..., None] * [1, x, y]
-            moments[:, :, half, -1] += weight * (n * n).sum(-1)
+        # The midpoints of the edges stand at (½, 0), (½, ½) and (0, ½) in the frame of a, b, c.
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        det = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        weight = (0.5 / 3) / np.maximum(np.abs(det), epsilon)  # a third of the area, for each
+        for k, factor in enumerate((3, 1, 1, 0.5, 0.25, 0.5)):
+            np.multiply(weight, factor, out=moments[k, half])
+        for axis in range(2):
+            moments[6 + 3 * axis, half] = weight * (ab[axis] + bc[axis] + ca[axis])
+            moments[7 + 3 * axis, half] = weight * (0.5 * (ab[axis] + bc[axis]))
+            moments[8 + 3 * axis, half] = weight * (0.5 * (bc[axis] + ca[axis]))
+        moments[-1, half] = weight * (ab * ab + bc * bc + ca * ca).sum(0)
+    moments[:, 1] = np.tensordot(TURNED, moments[:, 1], 1)
     return moments
 
 
-def seen_from_parent(x: int, y: int) -> Array:
-    """Matrix (MOMENTS, MOMENTS) from moments of a child at (x, y) ∈ {0, 1}² to its parent's."""
-    # (1, x, y) of the parent in terms of those of the child, and the same for their products.
-    first = np.array([[1, 0, 0], [x / 2, 0.5, 0], [y / 2, 0, 0.5]])
+def transformed(first: Array) -> Array:
+    """Matrix (MOMENTS, MOMENTS) from moments in one frame to those in another.
+
+    ``first`` (3, 3) gives 1, x, y of the other frame in terms of those of the one.
+    """
     matrix = np.zeros((MOMENTS, MOMENTS))
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+    for i, j in zip(*np.triu_indices(3), strict=True):
         np.add.at(matrix[PRODUCTS[i, j]], PRODUCTS.ravel(), np.outer(first[i], first[j]).ravel())
     matrix[6:9, 6:9] = matrix[9:12, 9:12] = first
     matrix[-1, -1] = 1
     return matrix
 
 
+#: From the frame of n_3, n_2, n_1 to that of the quad.
+TURNED = transformed(np.array([[1.0, 0, 0], [1, -1, 0], [1, 0, -1]]))
+
+
 def merged(moments: Array) -> Array:
     """Moments of the clusters of the next level; a last odd row or column is left out."""
-    rows, columns = (n // 2 for n in moments.shape[:2])
-    child = {
-        (x, y): moments[y : 2 * rows : 2, x : 2 * columns : 2] @ seen_from_parent(x, y).T
-        for x in (0, 1)
-        for y in (0, 1)
-    }
+    rows, columns = (n // 2 for n in moments.shape[2:])
+
+    def child(x, y):
+        seen = transformed(np.array([[1, 0, 0], [x / 2, 0.5, 0], [y / 2, 0, 0.5]]))
+        return np.tensordot(seen, moments[..., y : 2 * rows : 2, x : 2 * columns : 2], 1)
+
     # The parent's diagonal runs along those of its right upper and its left lower child.
-    halves = child[1, 0] + child[0, 1]
-    halves[:, :, 0] += child[0, 0].sum(2)
-    halves[:, :, 1] += child[1, 1].sum(2)
+    halves = child(1, 0) + child(0, 1)
+    halves[:, 0] += child(0, 0).sum(1)
+    halves[:, 1] += child(1, 1).sum(1)
     return halves
 
 
 def solve(moments: Array) -> tuple[Array, Array]:
-    """Least-squares normals (…, 4, 2) and residuals (…) of clusters, from their moments (Eq. 8)."""
+    """Least-squares normals (R, C, 4, 2) and residuals (R, C) of clusters (Eq. 8).
+
+    ``moments``: (MOMENTS, 2 halves, R, C).
+    """
+    moments = np.moveaxis(moments, (0, 1), (-1, -2))
     A = np.einsum("hip,...hpq,hjq->...ij", PHI, moments[..., PRODUCTS], PHI, optimize=True)
     first = moments[..., 6:12].reshape(*moments.shape[:-1], 2, 3)
     b = np.einsum("hip,...hap->...ia", PHI, first, optimize=True)
