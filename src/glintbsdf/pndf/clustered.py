@@ -49,9 +49,10 @@ RUNG = 0.25
 
 #: A map that goes on as its border does (clamp) is stored with borders as wide as the largest
 #: block, which may be at most this share of the map.
-BORDER = 1 / 8
+BORDER = 1 / 16
 
-#: Memory allowed for the lists, bytes per element.
+#: Memory allowed for the lists of rung k: bytes per element, times 2^(k - 1). Higher rungs have few
+#: elements, but these reach far in the plane of normals.
 BYTES_PER_ELEMENT = 42
 
 #: Bits of the first word of an element that hold its column; the level has the others.
@@ -349,7 +350,8 @@ class Ladder:
         rungs = []
         for _, cut, shift in cuts:
             blocks = BlocksOfElements(cut, rows, columns, shift, triangles)
-            lists = Builder(blocks, normals, bounds, BYTES_PER_ELEMENT).arrays()
+            allowed = BYTES_PER_ELEMENT << (shift - SHIFT - 1)
+            lists = Builder(blocks, normals, bounds, allowed).arrays()
             lists["start"] += np.uint32(entries)
             lists["slab_of_x"] = lists["slab_of_x"].astype(np.uint32) + slabs
             lists["first_of_row"] = blocks.first[: -1 : blocks.columns] + elements
@@ -444,7 +446,7 @@ class ClusteredManifold(Manifold):
     So τ is the mean squared distance (texels²) by which a cluster as large as the footprint's
     r_x × r_y may misplace a normal; smaller ones may do so more. It bounds no error of the P-NDF,
     which grows with it: see ``benchmarks/clusters.py``. Footprints of a few texels are exact, and
-    so are maps smaller than 16 texels (128, where the map is clamped).
+    so are maps smaller than 16 texels (256, where the map is clamped).
 
     A cluster's triangle of area below ε/2 is replaced as the map's own are: a flat part of the map
     keeps the highlight that it has without clusters.
