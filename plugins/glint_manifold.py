@@ -67,8 +67,11 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
  * - masking
    - |string|
-   - Masking and shadowing: :monosp:`beckmann`, that of a Beckmann surface as rough as the map,
-     or :monosp:`none`. (Default: :monosp:`beckmann`)
+   - Masking and shadowing by the projected area of the facets under the footprint:
+     :monosp:`ggx_fit`, that of the GGX surface that fits them best; :monosp:`analytic`, their own,
+     exact but many times slower, as every triangle under the footprint counts. Or
+     :monosp:`beckmann`, that of a Beckmann surface as rough as the whole map, or :monosp:`none`.
+     (Default: :monosp:`ggx_fit`)
 
  * - height_correlated
    - |bool|
@@ -160,6 +163,9 @@ from glintbsdf.kernels import KERNELS
 from glintbsdf.microfacet import MapBeckmannMasking
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import ClusteredManifold, Manifold
+from glintbsdf.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
+
+MASKINGS = ("ggx_fit", "analytic", "beckmann", "none")
 
 
 class GlintManifold(GlintBSDF):
@@ -180,11 +186,14 @@ class GlintManifold(GlintBSDF):
             epsilon=parameters.number("epsilon", 1e-6),
             owner=self.owner,
         )
-        masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
+        masking = parameters.choice("masking", "ggx_fit", MASKINGS)
         height_correlated = parameters.boolean("height_correlated", True)
-        self.masking = None
-        if masking == "beckmann":
-            self.masking = MapBeckmannMasking(self.pndf, height_correlated)
+        self.masking = {
+            "ggx_fit": lambda: ProjectedAreaMasking(GgxFit(self.pndf), height_correlated),
+            "analytic": lambda: ProjectedAreaMasking(ProjectedArea(self.pndf), height_correlated),
+            "beckmann": lambda: MapBeckmannMasking(self.pndf, height_correlated),
+            "none": lambda: None,
+        }[masking]()
 
 
 mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))

@@ -191,8 +191,6 @@ BAD_OWN_PARAMETERS = [
     ({"threshold": suite.NAN}, "threshold"),
     ({"max_error": 0.01}, "max_error"),
     ({"max_error": -1.0}, "max_error"),
-    ({"masking": "ggx_fit"}, "masking"),
-    ({"masking": "analytic"}, "masking"),
     ({"masking": "smith"}, "masking"),
     ({"height_correlated": "yes"}, "height_correlated"),
 ]

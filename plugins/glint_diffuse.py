@@ -1,0 +1,209 @@
+r"""
+.. _bsdf-glint_diffuse:
+
+Diffuse facets of a normal map (:monosp:`glint_diffuse`)
+--------------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Image file of the normal or height map: OpenEXR, PNG, TIFF and what else Mitsuba reads. A
+     relative name counts from the scene's folder.
+
+ * - bitmap
+   - :monosp:`mitsuba.Bitmap`
+   - The map itself, instead of :monosp:`filename`, when the scene is built in Python.
+
+ * - data
+   - |tensor|
+   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
+     the map in use: the projected normals, H×W×2.
+   - |exposed|, |differentiable|
+
+ * - map_type, height_scale, wrap_mode
+   - |string|, |float|, |string|
+   - What the map holds and what lies beyond its border, as for
+     :ref:`glint_manifold <bsdf-glint_manifold>`. (Default: :monosp:`auto`, 1, :monosp:`repeat`)
+
+ * - to_uv
+   - |transform|
+   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
+   - |exposed|
+
+ * - reflectance
+   - |spectrum| or |texture|
+   - Reflectance of the facets, in [0, 1]. (Default: 0.5)
+   - |exposed|, |differentiable|
+
+ * - method
+   - |string|
+   - :monosp:`manifold`: the facets under the footprint, every one of them; or
+     :monosp:`oren_nayar`: Oren and Nayar's model, as rough as the footprint's facets, around their
+     mean normal. Faster, and blind to what is smaller than a pixel. (Default: :monosp:`manifold`)
+
+ * - footprint_sigma
+   - |float|
+   - Standard deviation of the footprint, in pixels. (Default: 0.5)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - pixel_spread
+   - |float|
+   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
+     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
+     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+   - |exposed|, |differentiable|, |discontinuous|
+
+A diffuse surface with a normal map, free of aliasing. The usual way, :monosp:`diffuse` inside
+:monosp:`normalmap`, looks at one normal of the pixel's footprint per sample. This material
+integrates the light that all facets under the footprint reflect :cite:`Wu24Glint`,
+
+.. math::
+
+    f_d = \frac{P(\omega)}{\pi\,\omega_z}, \qquad
+    P(\omega) = \int D(m) \max(m \cdot \omega, 0)\,\mathrm{d}m,
+
+where :math:`\omega` points to the light and :math:`P`, the projected area of the facets, has a
+closed form for each triangle of the map. It is sampled by the cosine of the surface.
+
+A facet counts with its own area, which is larger than the surface's below it; facets neither hide
+nor light each other. For steep maps the surface therefore reflects more than
+:monosp:`reflectance`, by a quarter of the mean squared slope.
+
+Footprints of up to 4096 texels are summed facet by facet, larger ones over as many facets, spread
+evenly: the cost of a large footprint is bounded, but large.
+
+The material is one-sided: use the ``twosided`` adapter for both sides. The shape needs UV
+coordinates.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: lst-glint_diffuse
+
+        <bsdf type="glint_diffuse">
+            <string name="filename" value="plaster.exr"/>
+            <rgb name="reflectance" value="0.8, 0.7, 0.6"/>
+        </bsdf>
+
+    .. code-tab:: python
+
+        'type': 'glint_diffuse',
+        'filename': 'plaster.exr',
+        'reflectance': {'type': 'rgb', 'value': [0.8, 0.7, 0.6]}
+
+Reference: Liwen Wu, Fujun Luan, Miloš Hašan and Ravi Ramamoorthi, "Position-Normal Manifold for
+Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), section 4.3 and, for
+:monosp:`oren_nayar`, appendix C.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.bsdf import FootprintBSDF
+from glintbsdf.diffuse import FacetDiffuse, OrenNayarDiffuse
+from glintbsdf.parameters import Parameters
+from glintbsdf.pndf.manifold import TexelMesh
+
+METHODS = {"manifold": FacetDiffuse, "oren_nayar": OrenNayarDiffuse}
+
+
+class GlintDiffuse(FootprintBSDF):
+    """The plugin ``glint_diffuse``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        parameters = Parameters(props)
+        self.mesh = TexelMesh(parameters.normal_map(), owner=self.owner)
+        self.reflectance = parameters.spectrum("reflectance", 0.5, maximum=1.0)
+        self.method = METHODS[parameters.choice("method", "manifold", tuple(METHODS))](self.mesh)
+        self.m_flags = (
+            mi.BSDFFlags.DiffuseReflection
+            | mi.BSDFFlags.FrontSide
+            | mi.BSDFFlags.SpatiallyVarying
+            | mi.BSDFFlags.Anisotropic
+        )
+        self.m_components = [self.m_flags]
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        self.mesh.traverse(callback)
+        super().traverse(callback)
+        callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        super().parameters_changed(keys)
+        self.mesh.parameters_changed(keys)
+        if not keys or "data" in keys:
+            self.method.parameters_changed()
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        bs = dr.zeros(mi.BSDFSample3f)
+        if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection):
+            return bs, mi.Spectrum(0)
+        bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
+        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
+        bs.eta = 1
+        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+        bs.sampled_component = 0
+        return bs, value / dr.select(bs.pdf > 0, bs.pdf, 1)
+
+    def eval(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Spectrum:
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Float:
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+    def eval_pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection):
+            return mi.Spectrum(0), mi.Float(0)
+        active = mi.Bool(active) & (si.wi.z > 0) & (wo.z > 0)
+        # Lanes below the horizon must stay finite: their derivatives would be NaN.
+        up = mi.Vector3f(0, 0, 1)
+        wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
+        white = self.method.eval(wi, wo, ctx.mode, self.footprint(si), active)
+        value = dr.select(active, self.reflectance.eval(si, active) * white, 0)
+        pdf = dr.select(active, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
+        return mi.mueller.depolarizer(value) if mi.is_polarized else value, pdf
+
+    def eval_diffuse_reflectance(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool = True
+    ) -> mi.Spectrum:
+        albedo = self.reflectance.eval(si, active)
+        return mi.mueller.depolarizer(albedo) if mi.is_polarized else albedo
+
+    def members(self) -> dict[str, object]:
+        return {
+            "mesh": self.mesh,
+            "method": self.method,
+            "reflectance": self.reflectance,
+            **super().members(),
+        }
+
+
+mi.register_bsdf("glint_diffuse", lambda props: GlintDiffuse(props))
