@@ -209,8 +209,8 @@ def principal_axes(kernel: TexelKernel):
     return axis * dr.rsqrt(dr.squared_norm(axis)), major, minor
 
 
-def taps(variance_major, variance_minor, variance):
-    """How to make a stretched Gaussian of round ones of at least this variance.
+def taps(variance_major, variance):
+    """How to make a Gaussian, stretched along one axis, of round ones of the variance across.
 
     Returns the variance of a round one, the distance between two, how many there are on either side
     of the middle, and the ``s`` of their weights ``exp(−s k²)``.
@@ -221,7 +221,7 @@ def taps(variance_major, variance_minor, variance):
     steps = dr.select(many, dr.ceil(REACH / STEP * spread / sigma), dr.select(one, 1, 0))
     reach = dr.select(many, REACH / dr.maximum(steps, 1), REACH_OF_ONE)
     steps = dr.detach(steps)  # constant but for jumps, and a loop counts to it
-    variance = dr.select(one, variance, 0.5 * (variance_major + variance_minor))
+    variance = dr.select(one, variance, 0.5 * (variance_major + variance))
     return variance, reach * spread, steps, 0.5 * dr.square(reach)
 
 
@@ -324,7 +324,7 @@ class MomentPyramid:
         kernel = TexelKernel("gaussian", footprint, self.height, self.width, self.wrap_mode)
         major, variance_major, variance_minor = principal_axes(kernel)
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
-        variance, step, steps, sharpness = taps(variance_major, variance_minor, variance)
+        variance, step, steps, sharpness = taps(variance_major, variance)
         # The coarsest level that is fine enough, wherever the lookup falls between its samples.
         level = dr.clip(
             dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 4))) / (2 * log2(RATIO))) + 1,

@@ -222,7 +222,7 @@ def sample_above(x, survival, active):
         z = x + dr.sqrt(q)
         rest = dr.fma(-x, mills_ratio(z), 1)
         excess = dr.log(rest / start) - 0.5 * (z * z - x * x) - log_survival
-        return q + 2 * rest * dr.maximum(excess, 0)
+        return q + 2 * rest * excess
 
     def advance(q, count, active):
         improved = step(q)
