@@ -189,7 +189,6 @@ BAD_OWN_PARAMETERS = [
     ({"threshold": -0.004}, "threshold"),
     ({"threshold": 0.004, "max_error": 0.05}, "threshold"),
     ({"threshold": suite.NAN}, "threshold"),
-    ({"max_error": 0.01}, "max_error"),
     ({"max_error": -1.0}, "max_error"),
     ({"masking": "smith"}, "masking"),
     ({"height_correlated": "yes"}, "height_correlated"),

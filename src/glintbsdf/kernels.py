@@ -85,13 +85,22 @@ class TexelKernel:
     The determinant comes from the factor's cross product, so rank-one and 1000:1 footprints keep
     their digits.
 
+    ``added`` (texels²): variance added to Σ along u and v, :data:`SIGMA_MIN` squared by default.
+
     Attributes:
+        minor_variance (mi.Float): smaller eigenvalue of Σ, texels².
         mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
         reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
     """
 
     def __init__(
-        self, kernel: str, footprint: Footprint, height: int, width: int, wrap_mode: str
+        self,
+        kernel: str,
+        footprint: Footprint,
+        height: int,
+        width: int,
+        wrap_mode: str,
+        added: tuple = (SIGMA_MIN**2, SIGMA_MIN**2),
     ) -> None:
         check_choice("TexelKernel", "kernel", kernel, KERNELS)
         self.kernel = kernel
@@ -107,12 +116,17 @@ class TexelKernel:
 
         du, dv = limit_extent(footprint.du, footprint.dv)
         du, dv = du * size, dv * size
-        s2 = SIGMA_MIN**2
-        variance_u = dr.fma(du.x, du.x, dr.fma(dv.x, dv.x, s2))
-        variance_v = dr.fma(du.y, du.y, dr.fma(dv.y, dv.y, s2))
+        own_u, own_v = dr.fma(du.x, du.x, dv.x * dv.x), dr.fma(du.y, du.y, dv.y * dv.y)
+        added_u, added_v = added
+        variance_u, variance_v = own_u + added_u, own_v + added_v
         covariance = dr.fma(du.x, du.y, dv.x * dv.y)
         cross = difference_of_products(du.x, dv.y, du.y, dv.x)
-        determinant = dr.fma(cross, cross, s2 * (variance_u + variance_v - s2))
+        determinant = dr.fma(cross, cross, added_u * own_v + added_v * variance_u)
+
+        # The smaller eigenvalue from the larger one, as their difference cancels.
+        half = 0.5 * (variance_u - variance_v)
+        radius = dr.sqrt(dr.fma(half, half, covariance * covariance))
+        self.minor_variance = determinant / (0.5 * (variance_u + variance_v) + radius)
 
         self.sigma_u, self.sigma_v = dr.sqrt(variance_u), dr.sqrt(variance_v)
         self.shear = covariance / variance_v

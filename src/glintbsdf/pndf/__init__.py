@@ -4,5 +4,6 @@ from .clustered import ClusteredManifold
 from .filtered import Filtered
 from .grid import Grid
 from .manifold import Manifold
+from .tabulated import TabulatedManifold
 
-__all__ = ["ClusteredManifold", "Filtered", "Grid", "Manifold"]
+__all__ = ["ClusteredManifold", "Filtered", "Grid", "Manifold", "TabulatedManifold"]
