@@ -33,6 +33,7 @@ from ..hashing import pcg3d, uniform
 from ..kernels import SIGMA_MIN, TexelKernel
 from ..lattice import floor_int
 from ..normalmap import NormalMap
+from ..progress import progress
 from .manifold import Manifold, normal_in_quad
 
 #: Bins along each axis of the rectangle of the map's normals.
@@ -51,8 +52,8 @@ BYTES = 64e6
 #: Smallest bins, in units of projected normals: what no light resolves (half the sun's radius).
 MIN_BIN = 1e-3
 
-#: Pairs of a triangle and a bin that the build may visit; else, bins are made larger.
-MAX_PAIRS = 3e8
+#: Bins per quad that the build may visit; where the normals jump further, bins are made larger.
+MAX_BINS_PER_QUAD = 300
 
 #: Smallest distance of nodes, texels. Below, the exact lists are as fast.
 MIN_SPACING = 8
@@ -157,7 +158,7 @@ class Tables:
             size = np.maximum((upper - lower) / bins, MIN_BIN)
             shape = np.maximum(np.ceil((upper - lower) / size - 1e-6), 1).astype(int)
             spread = Spread(lattice, triangles, lower, size, shape)
-            if spread.pairs() <= MAX_PAIRS:
+            if spread.bins_per_quad() <= MAX_BINS_PER_QUAD:
                 break
         filled = spread.filled_bins()
         rows = np.full(shape[0] * shape[1], Tables.EMPTY, np.uint32)
@@ -263,13 +264,13 @@ class Spread:
         )
         return corners, *rectangle
 
-    def pairs(self) -> float:
-        """Number of pairs of a triangle and a bin that it may touch, estimated from some quads."""
+    def bins_per_quad(self) -> float:
+        """Bins that the bounds of a quad's two triangles touch, estimated from some quads."""
         height, width = self.lattice.y.quads, self.lattice.x.quads
         quad = np.random.default_rng(0).integers(0, height * width, 20_000)
         row, column = (mi.Int(v) for v in divmod(quad, width))
         _, x0, y0, x1, y1 = self.touched_bins(row, column, mi.Bool(quad % 2 == 0))
-        return float(np.mean(((x1 - x0 + 1) * (y1 - y0 + 1)).numpy())) * 2 * height * width
+        return 2 * float(np.mean(((x1 - x0 + 1) * (y1 - y0 + 1)).numpy()))
 
     def scan(self, top, bottom, left, right, visit) -> None:
         """Call ``visit(corners, x, y, row, column, active)`` for the bins (``x``, ``y``) of all
@@ -374,21 +375,27 @@ class Spread:
                         mode=dr.ReduceMode.NoConflicts,
                     )
 
-        for odd_y, odd_x in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            node_y, node_x = (
-                v.ravel()
-                for v in np.meshgrid(np.arange(odd_y, shape[0], 2), np.arange(odd_x, shape[1], 2))
-            )
-            if node_y.size == 0:
-                continue
-            top, bottom = edges[0][node_y], edges[0][node_y + 1]
-            left, right = edges[1][node_x], edges[1][node_x + 1]
-            self.scan(top, bottom, left, right, add)
-            dr.eval(mass)
+        with progress("Building tables of normals") as report:
+            for done, (odd_y, odd_x) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+                node_y, node_x = (
+                    v.ravel()
+                    for v in np.meshgrid(
+                        np.arange(odd_y, shape[0], 2), np.arange(odd_x, shape[1], 2)
+                    )
+                )
+                if node_y.size == 0:
+                    continue
+                top, bottom = edges[0][node_y], edges[0][node_y + 1]
+                left, right = edges[1][node_x], edges[1][node_x + 1]
+                self.scan(top, bottom, left, right, add)
+                dr.eval(mass)
+                dr.sync_thread()
+                report((done + 1) / 4)
         return np.ascontiguousarray(np.moveaxis(mass.numpy().reshape(shape), -1, 0))
 
 
 def doubled_area(a, b, c):
+    """Twice the signed area of a triangle."""
     return (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x)
 
 
