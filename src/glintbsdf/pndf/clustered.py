@@ -8,10 +8,10 @@ may stand for its quads whose residual satisfies
 
 the coarsest first: a *cut* through the tree of clusters. The paper walks down the tree in every
 query. Here the cuts are made when the map is loaded, for a ladder of values of r_x r_y τ, each of
-which leaves about a quarter of the elements of the one before; every rung has inverted lists, as
-the quads have them (:mod:`~glintbsdf.pndf.quad_lists`), so that a query is one flat loop. A query
-uses the highest rung whose value is not above its own r_x r_y τ: the criterion holds for every
-cluster it meets, and at most four times as many are kept as the criterion would allow.
+which leaves a quarter of the elements of the one before; every rung has inverted lists, as the
+quads have them (:mod:`~glintbsdf.pndf.quad_lists`), so that a query is one flat loop. A query uses
+the highest rung whose value is not above its own r_x r_y τ: the criterion holds for every cluster
+it meets, though it would allow others as well.
 
 Evaluation and sampling use the same rung, hence the same triangles, which tile the texel lattice:
 the mass is 1 and the density of samples exact at every setting.
@@ -42,18 +42,23 @@ from .manifold import (
 )
 from .quad_lists import RESOLUTION, SHIFT, Builder, NormalCells, Packed, QuadLists, walk
 
-#: Rung k of the ladder has at most this share, to the power k, of the elements that rung 0, the
-#: quads, has. Its blocks have the side BLOCK·2^k, as its elements are 2^k wide on average; none of
-#: them is larger than a block.
+#: Rung k of the ladder has at most this share, to the power k, of the quads' number of elements.
+#: Its blocks have the side BLOCK·2^k, as its elements are 2^k wide on average; none of them is
+#: larger than a block.
 RUNG = 0.25
+
+#: The first rung that is made. Measured on rough maps, lists of a quarter of the elements take as
+#: long as those of the quads, because larger triangles reach into more cells of normals: an error
+#: for nothing. From a sixteenth on they are faster. Smooth maps reach higher rungs at once.
+FIRST_RUNG = 2
 
 #: A map that goes on as its border does (clamp) is stored with borders as wide as the largest
 #: block, which may be at most this share of the map.
 BORDER = 1 / 16
 
-#: Memory allowed for the lists of rung k: bytes per element, times 2^(k - 1). Higher rungs have few
-#: elements, but these reach far in the plane of normals.
-BYTES_PER_ELEMENT = 42
+#: Memory allowed for the lists of the first rung, bytes per element; twice as much on each further
+#: one. Higher rungs have few elements, but these reach far in the plane of normals.
+BYTES_PER_ELEMENT = 120
 
 #: Bits of the first word of an element that hold its column; the level has the others.
 COLUMN_BITS = 27
@@ -102,9 +107,12 @@ def smallest_threshold(quads: int, residuals: list[np.ndarray], most: float, lim
 
 
 def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: float) -> list[tuple]:
-    """The ladder: for each rung its threshold, its cut, and log2 of the side of its blocks."""
+    """The ladder: for each rung its threshold, its cut, and log2 of the side of its blocks.
+
+    ``rungs`` is the highest that there may be, ``limit`` the largest threshold that matters.
+    """
     cuts = []
-    for rung in range(1, rungs + 1):
+    for rung in range(FIRST_RUNG, rungs + 1):
         usable = residuals[: rung + SHIFT]
         threshold = smallest_threshold(quads, usable, quads * RUNG**rung, limit)
         if threshold is None:
@@ -150,7 +158,7 @@ class ClusterLattice:
     Attributes:
         x, y (Axis): columns and rows. Where the map is clamped, their borders are wider than those
             of the mesh, see :data:`BORDER`.
-        rungs (int): how many rungs the ladder may have: 0 for maps smaller than a block.
+        rungs (int): the highest rung of the ladder, 0 where the map is too small for any.
         levels (int): of clusters.
         shapes (list of pairs): rows and columns of whole clusters, by level; level 0 is the quads.
         first (list): clusters of lower levels than each, and the number of all.
@@ -159,7 +167,8 @@ class ClusterLattice:
 
     def __init__(self, height: int, width: int, wrap_mode: str) -> None:
         side = min(height, width) * {"repeat": 1, "mirror": 2, "clamp": BORDER}[wrap_mode]
-        self.rungs = max(0, int(side).bit_length() - 1 - SHIFT)
+        rungs = int(side).bit_length() - 1 - SHIFT
+        self.rungs = rungs if rungs >= FIRST_RUNG else 0
         block = BLOCK << self.rungs
         self.x, self.y = Axis(width, wrap_mode, block), Axis(height, wrap_mode, block)
         self.levels = self.rungs + SHIFT if self.rungs else 0
@@ -208,8 +217,8 @@ class Ladder:
     """A ladder of cuts through the tree of clusters, with inverted lists for each.
 
     Made of the arrays of :meth:`build` (NumPy), wherever they were kept since; K rungs:
-        ``thresholds`` (K): the least r_x r_y τ of the queries that use the rungs 1…K; on rung 0
-        there are no clusters. Nothing else where K = 0;
+        ``thresholds`` (K): the least r_x r_y τ of the queries that use the cuts 1…K, 0 being no
+        clusters at all. Nothing else where K = 0;
         ``residuals`` (N): of the clusters of all levels that are reached, level by level;
         ``normals`` (N, 4, 2): theirs;
         ``shifts`` (K): log2 of the side of the blocks;
@@ -350,7 +359,7 @@ class Ladder:
         rungs = []
         for _, cut, shift in cuts:
             blocks = BlocksOfElements(cut, rows, columns, shift, triangles)
-            allowed = BYTES_PER_ELEMENT << (shift - SHIFT - 1)
+            allowed = BYTES_PER_ELEMENT << (shift - SHIFT - FIRST_RUNG)
             lists = Builder(blocks, normals, bounds, allowed).arrays()
             lists["start"] += np.uint32(entries)
             lists["slab_of_x"] = lists["slab_of_x"].astype(np.uint32) + slabs
@@ -446,10 +455,11 @@ class ClusteredManifold(Manifold):
     So τ is the mean squared distance (texels²) by which a cluster as large as the footprint's
     r_x × r_y may misplace a normal; smaller ones may do so more. It bounds no error of the P-NDF,
     which grows with it: see ``benchmarks/clusters.py``. Footprints of a few texels are exact, and
-    so are maps smaller than 16 texels (256, where the map is clamped).
+    so are maps smaller than 32 texels (512, where the map is clamped).
 
-    A cluster's triangle of area below ε/2 is replaced as the map's own are: a flat part of the map
-    keeps the highlight that it has without clusters.
+    A cluster's triangle of an area below ε/2 on the disk, whatever its size in texels, is replaced
+    as the map's own are: a flat part of the map keeps the size that its highlight has without
+    clusters.
 
     Args:
         normal_map (NormalMap): the map.
