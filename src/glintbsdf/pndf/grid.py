@@ -235,36 +235,46 @@ class ReflectingCount:
 
     def draw(self, bits: mi.UInt32, n: mi.Float, active: mi.Bool) -> mi.Float:
         """The count for random ``bits``; ``n`` is a whole number up to 1e30."""
+        u, mean = uniform(bits), n * self.p
+        few = mean <= EXACT_MEAN
+        # P(N = 0) ≥ 1 − n P: most cells hold nothing that reflects, and this saves their search
+        some = active & few & (u >= 1 - mean)
         (count,) = dr.if_stmt(
-            (bits, n),
-            active & (n * self.p <= EXACT_MEAN),
-            lambda bits, n: (self.exact(uniform(bits), n),),
-            lambda bits, n: (self.approximate(gaussian(bits), n),),
+            (n, mi.Bool(some)),
+            some,
+            lambda n, some: (self.exact(u, n, some),),
+            lambda n, some: (dr.select(few, 0, self.approximate(gaussian(bits), n)),),
             label="count",
         )
         return dr.select(self.inverted, n - count, count)
 
-    def exact(self, u: mi.Float, n: mi.Float) -> mi.Float:
+    def exact(self, u: mi.Float, n: mi.Float, active: mi.Bool) -> mi.Float:
         """By inversion: the number of values of the distribution function that are ≤ u."""
-        probability = dr.exp(n * self.log_none)
-        below, count = probability, mi.Float(0)
-        for k in range(EXACT_TERMS):
-            count = count + dr.select(u >= below, 1, 0)
-            ratio = dr.maximum(n - k, 0) * (self.odds / (k + 1))
-            probability = probability * ratio
-            reached, below = below, below + probability
+
+        def more(count, probability, below):
+            # From P(N = k) and P(N ≤ k) to those of k + 1
+            probability = probability * dr.maximum(n - count, 0) * self.odds / (count + 1)
+            return count + 1, probability, below + probability
+
+        none = dr.exp(n * self.log_none)
+        count, probability, below = dr.while_loop(
+            (mi.Float(0), none, none + 0),
+            lambda count, probability, below: active & (u >= below) & (count < EXACT_TERMS),
+            more,
+            label="binomial",
+        )
         ratio = dr.maximum(n - EXACT_TERMS, 0) * (self.odds / (EXACT_TERMS + 1))
 
         def tail(count):
             # From here on P(N ≥ k) falls by the same ratio with every k, up to N = n
             log_ratio = dr.log(ratio)
-            left = (1 - u) / (1 - reached)
+            left = (1 - u) / (1 - (below - probability))
             last = dr.exp(log_ratio * (n - EXACT_TERMS + 1))
             return (count + dr.floor(dr.log(dr.fma(left, 1 - last, last)) / log_ratio),)
 
         return dr.if_stmt(
             (count,),
-            (count == EXACT_TERMS) & (ratio > 0),
+            active & (count == EXACT_TERMS) & (ratio > 0),
             tail,
             lambda count: (count,),
             label="tail",
