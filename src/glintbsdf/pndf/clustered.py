@@ -196,8 +196,7 @@ class CellsOfRung(NormalCells):
     """The cells of normals of one rung per lane, see :class:`Ladder`."""
 
     def __init__(self, ladder: Ladder, rung, active) -> None:
-        self.lower = dr.gather(mi.Vector2f, ladder.lower, rung, active)
-        self.scale = dr.gather(mi.Vector2f, ladder.scale, rung, active)
+        self.lower, self.scale = ladder.lower, ladder.scale
         self.divisions = dr.gather(mi.UInt32, ladder.divisions, rung, active)
         self.slab_of_x, self.cell_of_y = ladder.slab_of_x, ladder.cell_of_y
         self.begin = ladder.begin("slab_of_x", rung, active)
@@ -245,9 +244,8 @@ class Ladder:
             mi.UInt32(arrays["divisions"]),
             mi.UInt32(arrays["begin"].ravel()),
         )
-        scale = RESOLUTION / (arrays["upper"] - arrays["lower"])
-        self.lower = mi.Float(np.tile(arrays["lower"], len(self.thresholds)))
-        self.scale = mi.Float(np.tile(scale.astype(np.float32), len(self.thresholds)))
+        self.lower = arrays["lower"]
+        self.scale = (RESOLUTION / (arrays["upper"] - self.lower)).astype(np.float32)
 
     @property
     def nbytes(self) -> int:
@@ -404,11 +402,9 @@ class BlocksOfElements:
         self.triangles_of_element = triangles
         self.device_first = mi.UInt32(self.first.astype(np.uint32))
         self.device_elements = mi.UInt32(self.elements.ravel())
-        # One compiled kernel serves the lists of all rungs.
-        self.opaque_columns = dr.opaque(mi.UInt32, self.columns)
 
     def first_of(self, block_row, block_column, offset=0):
-        index = block_row * self.opaque_columns + block_column + offset
+        index = block_row * self.columns + block_column + offset
         return dr.gather(mi.UInt32, self.device_first, index)
 
     def count(self, block_row, block_column):

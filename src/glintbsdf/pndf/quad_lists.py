@@ -171,10 +171,16 @@ class NormalCells:
         self.cell_of_y = mi.UInt32(cell_of_y.astype(np.uint32).ravel())
 
     @staticmethod
-    def tables(normals: np.ndarray, lower, upper, divisions: int):
-        """The tables ``(slab_of_x, cell_of_y)`` for these normals, (N, 2)."""
+    def histogram(normals: np.ndarray, lower, upper) -> np.ndarray:
+        """Number of normals (N, 2) per pixel of the tables, by x and y."""
         pixel = ((normals - lower) * (RESOLUTION / (upper - lower))).astype(np.int64)
         x, y = np.clip(pixel, 0, RESOLUTION - 1).T
+        counts = np.bincount(x * RESOLUTION + y, minlength=RESOLUTION**2)
+        return counts.reshape(RESOLUTION, RESOLUTION)
+
+    @staticmethod
+    def tables(histogram: np.ndarray, divisions: int):
+        """The tables ``(slab_of_x, cell_of_y)`` for normals with this histogram."""
 
         def cut(counts):
             mass = np.cumsum(counts) / max(counts.sum(), 1)
@@ -182,11 +188,10 @@ class NormalCells:
             before = 0.5 * (np.append(0, mass[:-1]) + np.append(0, uniform[:-1]))
             return np.minimum(before * divisions, divisions - 1).astype(np.uint8)
 
-        slab_of_x = cut(np.bincount(x, minlength=RESOLUTION))
-        joint = np.bincount(
-            slab_of_x[x].astype(np.int64) * RESOLUTION + y, minlength=divisions * RESOLUTION
-        )
-        return slab_of_x, np.stack([cut(row) for row in joint.reshape(divisions, RESOLUTION)])
+        slab_of_x = cut(histogram.sum(1))
+        slabs = np.zeros((divisions, RESOLUTION), np.int64)
+        np.add.at(slabs, slab_of_x, histogram)
+        return slab_of_x, np.stack([cut(counts) for counts in slabs])
 
     def pixel(self, value, axis):
         """Position of a coordinate in the table, in pixels."""
@@ -342,8 +347,9 @@ class Builder:
     """
 
     def __init__(self, blocks, normals, bounds, bytes_per_quad: float = BYTES_PER_QUAD) -> None:
-        self.blocks, self.normals, self.allowed = blocks, normals, bytes_per_quad
+        self.blocks, self.allowed = blocks, bytes_per_quad
         self.lower, self.upper = (np.asarray(v, np.float32) for v in bounds)
+        self.histogram = NormalCells.histogram(normals, self.lower, self.upper)
         self.rows, self.columns = blocks.rows, blocks.columns
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -386,7 +392,7 @@ class Builder:
 
     def use(self, divisions: int):
         """Divide the normals into ``divisions``² cells; returns the tables."""
-        tables = NormalCells.tables(self.normals, self.lower, self.upper, divisions)
+        tables = NormalCells.tables(self.histogram, divisions)
         self.cells = NormalCells(self.lower, self.upper, *tables)
         self.slab_edges, self.cell_edges = self.cells.edges()
         return tables
