@@ -193,9 +193,12 @@ def plane(bsdf: dict, size: int) -> mi.Scene:
     )
 
 
-def diffuse(
-    folder: Path | None, size: int = 96, many: int = 4096, scale: float = 25.0
-) -> list[dict]:
+def diffuse(folder: Path | None) -> list[dict]:
+    """At 6 and at 25 texels per pixel in the middle: one facet's width a pixel, and a quarter."""
+    return [row for scale in (25, 100) for row in diffuse_at(scale, folder)]
+
+
+def diffuse_at(scale: float, folder: Path | None, size: int = 96, many: int = 4096) -> list[dict]:
     normal_map = maps.isotropic(256, alpha=0.5, seed=1)
     to_uv = mi.ScalarTransform4f().scale([scale, scale, 1])
     n = normal_map.normals.astype(np.float64)
@@ -228,7 +231,9 @@ def diffuse(
     }
     references["oren_nayar"] = references["normalmap"]
     results, pictures = [], []
-    print(f"material      spp   RMSE / mean: from its {many} spp   from normalmap's {many} spp")
+    print(
+        f"map repeated {scale} times\nmaterial      spp   RMSE / mean: from its {many} spp   from normalmap's {many} spp"
+    )
     for spp in (1, 64):
         row = []
         for name, (bsdf, more) in materials.items():
@@ -239,12 +244,14 @@ def diffuse(
                 rmse(image, references[key]) / float(references[key].mean())
                 for key in (name, "normalmap")
             )
-            results.append({"material": name, "spp": spp, "own": own, "normalmap": other})
+            results.append(
+                {"scale": scale, "material": name, "spp": spp, "own": own, "normalmap": other}
+            )
             print(f"{name:12} {spp:4} {own:26.4f} {other:32.4f}", flush=True)
             row.append(image)
         pictures.append(row)
     if folder:
-        save(folder / "diffuse.png", [[*row, references["normalmap"]] for row in pictures])
+        save(folder / f"diffuse_{scale}.png", [[*row, references["normalmap"]] for row in pictures])
     return results
 
 
