@@ -231,9 +231,8 @@ def diffuse_at(scale: float, folder: Path | None, size: int = 96, many: int = 40
     }
     references["oren_nayar"] = references["normalmap"]
     results, pictures = [], []
-    print(
-        f"map repeated {scale} times\nmaterial      spp   RMSE / mean: from its {many} spp   from normalmap's {many} spp"
-    )
+    print(f"map repeated {scale} times; RMSE / mean")
+    print(f"material      spp            from its {many} spp   from normalmap's {many} spp")
     for spp in (1, 64):
         row = []
         for name, (bsdf, more) in materials.items():
