@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import OpenEXR
+import skimage.io
 from scipy.interpolate import CubicSpline
 
 from glintbsdf import maps
@@ -272,6 +273,60 @@ def plate() -> Mesh:
     return parametric(position, grid, grid, lambda s, t: np.stack([s, t], axis=-1) / 2 + 0.5)
 
 
+def dress() -> Mesh:
+    """A bell of cloth, 2 high, whose folds deepen from the waist (radius 0.22) to the hem."""
+    outline, length = spline(
+        [(0.30, 2.0), (0.24, 1.78), (0.22, 1.6), (0.34, 1.3), (0.52, 0.8), (0.74, 0.3), (0.95, 0.0)]
+    )
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        radius, height = np.moveaxis(outline(t), -1, 0)
+        depth = 0.13 * np.clip((t / length - 0.3) / 0.7, 0, 1) ** 2
+        radius = radius * (1 + depth * np.cos(9 * s + 0.8 * np.sin(2 * s)))
+        return np.stack([radius * np.cos(s), height, -radius * np.sin(s)], axis=-1)
+
+    mesh = parametric(
+        position,
+        np.linspace(0, 2 * np.pi, 145),
+        np.linspace(0, length, 33),
+        lambda s, t: np.stack([4 * s / (2 * np.pi), t], axis=-1),
+    )
+    return flipped(mesh)  # the outline runs downwards
+
+
+def terrain() -> Mesh:
+    """Rolling ground, 8 by 8, up to 0.6 high: waves of falling length in seeded directions."""
+    rng = np.random.default_rng(5)
+    frequencies = 0.9 * 1.5 ** np.arange(7)
+    angles, phases = rng.uniform(0, 2 * np.pi, (2, len(frequencies)))
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        height = np.zeros_like(s)
+        for frequency, angle, phase in zip(frequencies, angles, phases, strict=True):
+            wave = np.sin(frequency * (np.cos(angle) * s + np.sin(angle) * t) + phase)
+            height = height + 0.28 * wave / frequency**1.2
+        return np.stack([s, height, -t], axis=-1)
+
+    grid = np.linspace(-4, 4, 81)
+    return parametric(position, grid, grid, lambda s, t: np.stack([s, t], axis=-1))
+
+
+def disc() -> Mesh:
+    """A flat ring of radii 0.06 and 0.9 in the plane y = 0; u is the arc at radius 0.5, v the
+    radius, so that grooves along u are circles."""
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.stack([t * np.cos(s), np.zeros_like(s), -t * np.sin(s)], axis=-1)
+
+    mesh = parametric(
+        position,
+        np.linspace(0, 2 * np.pi, 129),
+        np.linspace(0.06, 0.9, 9),
+        lambda s, t: np.stack([0.5 * s, t], axis=-1),
+    )
+    return flipped(mesh)
+
+
 def flipped(mesh: Mesh) -> Mesh:
     """The same surface seen from its other side."""
     return mesh._replace(normals=-mesh.normals, triangles=mesh.triangles[:, ::-1])
@@ -286,6 +341,9 @@ MESHES = {
     "kettle_handle.ply": kettle_handle,
     "cove.ply": cove,
     "plate.ply": plate,
+    "dress.ply": dress,
+    "terrain.ply": terrain,
+    "disc.ply": disc,
 }
 
 
@@ -341,6 +399,22 @@ def write_exr(filename: Path, channels: dict[str, np.ndarray]) -> None:
     OpenEXR.File(header, halves).write(str(filename))
 
 
+# Grains of sand, sRGB: quartz, feldspar, iron-stained quartz, lime, garnet, magnetite
+SAND = [
+    (232, 219, 190),
+    (214, 168, 128),
+    (196, 134, 70),
+    (240, 236, 222),
+    (128, 52, 42),
+    (48, 44, 44),
+]
+
+
+def write_palette(filename: Path, colors: list[tuple[int, int, int]]) -> None:
+    """Write 8-bit sRGB ``colors`` as the pixels of one row of a PNG."""
+    skimage.io.imsave(filename, np.uint8([colors]), check_contrast=False)
+
+
 NORMAL_MAPS = {
     "isotropic.exr": lambda: maps.isotropic(MAP_SIZE, seed=1),
     "scratched.exr": lambda: maps.scratched(
@@ -361,6 +435,8 @@ def main(folder: Path) -> None:
     (folder / "maps").mkdir(exist_ok=True)
     for name, make in MESHES.items():
         write_ply(folder / "meshes" / name, make())
+    (folder / "palettes").mkdir(exist_ok=True)
+    write_palette(folder / "palettes" / "sand.png", SAND)
     write_exr(folder / "studio.exr", {"RGB": studio()})
     for name, make in NORMAL_MAPS.items():
         normals = make().normals

@@ -108,7 +108,9 @@ def test_assets_are_what_the_script_makes(tmp_path):
 
     made = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file())
     committed = {
-        path.relative_to(SCENES) for path in SCENES.rglob("*") if path.suffix in (".ply", ".exr")
+        path.relative_to(SCENES)
+        for path in SCENES.rglob("*")
+        if path.suffix in (".ply", ".exr", ".png")
     }
     assert set(made) == committed
 
