@@ -207,12 +207,15 @@ def test_interruption_leaves_nothing(folder, variant):
     process = subprocess.Popen(
         [*command, "-D", "size=512", "--spp", "65536"], stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + 60
-    while set(folder.iterdir()) == before and time.monotonic() < deadline:
-        time.sleep(0.05)
-    time.sleep(0.5)  # into loading or rendering
-    os.kill(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=120)
+    try:
+        deadline = time.monotonic() + 60
+        while set(folder.iterdir()) == before and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.5)  # into loading or rendering
+        os.kill(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=120)
+    finally:
+        process.kill()  # one that does not end would slow all that follows
     assert process.returncode == 1
     assert errors.strip() == "Aborted."
     assert set(folder.iterdir()) == before
