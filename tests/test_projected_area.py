@@ -474,7 +474,8 @@ def test_suite_with_masking(variant, masking):
 
 
 def test_derivative_is_that_of_the_value(variant):
-    # Against a central difference along a fixed direction. Measured: 1e-3 relative.
+    # Against a central difference along a fixed direction, in steps small enough for the kinks of
+    # max(s·ω, 0). Measured: 1e-3 relative.
     normal_map = MASKING_MAPS["rough"]
     step = np.random.default_rng(2).normal(size=normal_map.normals.shape).astype(np.float32)
     footprint, w = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.05), direction(1.5)
@@ -489,6 +490,6 @@ def test_derivative_is_that_of_the_value(variant):
         t = mi.Float(0)
         dr.enable_grad(t)
         dr.backward(value(t))
-        h = 1e-3
+        h = 3e-4
         difference = (value(mi.Float(h)) - value(mi.Float(-h)))[0] / (2 * h)
-        assert dr.grad(t)[0] == pytest.approx(difference, rel=0.01)
+        assert dr.grad(t)[0] == pytest.approx(difference, rel=5e-3)
