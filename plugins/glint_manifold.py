@@ -68,6 +68,13 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
      exactly. The error was calibrated on procedural maps where it is largest: on rough maps it is
      a fraction of this. With 0, evaluation is exact. Excludes :monosp:`threshold`. (Default: 0)
 
+ * - hand_over
+   - |float|
+   - Size of the footprint (geometric mean of its standard deviations), in texels, from which the
+     P-NDF gives way to LEAN's smooth lobe, which is all that is left at twice the size; 0 for
+     never. On maps of Gaussian bumps a few texels wide nothing is lost from about 128
+     texels on; scratches or flakes differ from a smooth lobe at any size. (Default: 0)
+
  * - masking
    - |string|
    - Masking and shadowing by the projected area of the facets under the footprint:
@@ -165,7 +172,7 @@ from glintbsdf.errors import check
 from glintbsdf.kernels import KERNELS
 from glintbsdf.microfacet import MapBeckmannMasking
 from glintbsdf.parameters import Parameters
-from glintbsdf.pndf import ClusteredManifold, Manifold, TabulatedManifold
+from glintbsdf.pndf import ClusteredManifold, HandOver, Manifold, TabulatedManifold
 from glintbsdf.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
 
 MASKINGS = ("ggx_fit", "analytic", "beckmann", "none")
@@ -178,8 +185,13 @@ class GlintManifold(GlintBSDF):
         super().__init__(props)
         parameters = Parameters(props)
         threshold, max_error = (parameters.number(name, 0.0) for name in ("threshold", "max_error"))
-        check(not (threshold and max_error), self.owner, "threshold",
-              'left out where "max_error" is given', threshold)
+        check(
+            not (threshold and max_error),
+            self.owner,
+            "threshold",
+            'left out where "max_error" is given',
+            threshold,
+        )
         create = Manifold
         if threshold:
             create = partial(ClusteredManifold, threshold=threshold)
@@ -199,6 +211,9 @@ class GlintManifold(GlintBSDF):
             "beckmann": lambda: MapBeckmannMasking(self.pndf, height_correlated),
             "none": lambda: None,
         }[masking]()
+        hand_over = parameters.number("hand_over", 0.0)
+        if hand_over:
+            self.pndf = HandOver(self.pndf, hand_over, self.owner)
 
 
 mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))

@@ -113,8 +113,8 @@ def test_moments_under_any_footprint(variant, name, axes):
     first, second = relative_errors(
         normal_map, averages(pyramid(normal_map), uv, axes), expected(normal_map, uv, axes)
     )
-    # Root mean square over footprints; measured up to 1.5 % and 2 % where two levels mix evenly.
-    assert np.sqrt((first**2).mean()) < 0.02 and np.sqrt((second**2).mean()) < 0.03
+    # Root mean square over footprints; measured 1.2 % and 1.5 % for the longest, half elsewhere.
+    assert np.sqrt((first**2).mean()) < 0.015 and np.sqrt((second**2).mean()) < 0.02
 
 
 def test_footprint_of_a_point_shows_the_texel(variant):

@@ -158,13 +158,13 @@ def test_visible_normals_are_distributed_as_their_density_says(variant, name, di
             / area_by_quadrature(name, distribution, w)
         )
         quadrature_error = abs(visible.sum() - 1)  # of a kink at w·m = 0 and of GGX's tail
-        assert quadrature_error < 0.02
+        assert quadrature_error < 0.03
         expected = (features(x, y) * visible).sum(axis=(1, 2)) / visible.sum()
         error = sampled.std(axis=1) / np.sqrt(count)
         # 15 features of 40 settings: 4.5 sigma; and as much for the quadrature as it errs on 1.
-        assert (np.abs(sampled.mean(axis=1) - expected) < 4.5 * error + quadrature_error).all(), (
-            view
-        )
+        assert (
+            np.abs(sampled.mean(axis=1) - expected) < 4.5 * error + quadrature_error + 1e-6
+        ).all(), view
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)

@@ -29,10 +29,10 @@ from .kernels import TexelKernel
 from .lattice import floor_int
 
 #: Standard deviation of a level over that of the one before.
-RATIO = sqrt(2)
+RATIO = 2 ** (1 / 3)
 
 #: Spacing of a level's samples over its standard deviation, at most, where that exceeds a texel.
-SPACING = 0.75
+SPACING = 0.8
 
 #: Level texels beyond the border of a map that is not periodic: there its border has faded out.
 BORDER = 6
@@ -44,7 +44,8 @@ CUT = 4.0
 #: of Gaussians ripples by 5 % at 2.3), and how far they reach, in standard deviations of the whole.
 STEP, REACH = 2.3, 2.3
 
-#: The same reach where there is one lookup on either side of the middle: nearest to the variance.
+#: The same reach where there is one lookup on either side of the middle, which comes nearest to the
+#: variance; it serves as long as what it adds is no wider than a lookup.
 REACH_OF_ONE = sqrt(3)
 
 #: Footprints whose major axis has a variance of 1 + ROUND² minor ones at most count as round.
@@ -217,7 +218,7 @@ def taps(variance_major, variance):
     """
     spread = dr.sqrt(dr.maximum(variance_major - variance, 0))
     sigma = dr.maximum(dr.sqrt(variance), SIGMA_LOOKUP)
-    one, many = spread > ROUND * sigma, REACH_OF_ONE * spread > STEP * sigma
+    one, many = spread > ROUND * sigma, spread > sigma
     steps = dr.select(many, dr.ceil(REACH / STEP * spread / sigma), dr.select(one, 1, 0))
     reach = dr.select(many, REACH / dr.maximum(steps, 1), REACH_OF_ONE)
     steps = dr.detach(steps)  # constant but for jumps, and a loop counts to it
@@ -325,9 +326,9 @@ class MomentPyramid:
         major, variance_major, variance_minor = principal_axes(kernel)
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
         variance, step, steps, sharpness = taps(variance_major, variance)
-        # The coarsest level that is fine enough, wherever the lookup falls between its samples.
+        # The coarsest level that is fine enough, with half of what interpolating adds at most.
         level = dr.clip(
-            dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 4))) / (2 * log2(RATIO))) + 1,
+            dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1,
             0,
             self.top - 1,
         )

@@ -3,7 +3,8 @@
 from .clustered import ClusteredManifold
 from .filtered import Filtered
 from .grid import Grid
+from .hand_over import HandOver
 from .manifold import Manifold
 from .tabulated import TabulatedManifold
 
-__all__ = ["ClusteredManifold", "Filtered", "Grid", "Manifold", "TabulatedManifold"]
+__all__ = ["ClusteredManifold", "Filtered", "Grid", "HandOver", "Manifold", "TabulatedManifold"]
