@@ -295,7 +295,7 @@ def dress() -> Mesh:
 
 
 def terrain() -> Mesh:
-    """Rolling ground, 8 by 8, up to 0.6 high: waves of falling length in seeded directions."""
+    """Rolling ground, 8 by 8, within 0.7 of y = 0: waves of falling length, seeded directions."""
     rng = np.random.default_rng(5)
     frequencies = 0.9 * 1.5 ** np.arange(7)
     angles, phases = rng.uniform(0, 2 * np.pi, (2, len(frequencies)))
@@ -304,7 +304,7 @@ def terrain() -> Mesh:
         height = np.zeros_like(s)
         for frequency, angle, phase in zip(frequencies, angles, phases, strict=True):
             wave = np.sin(frequency * (np.cos(angle) * s + np.sin(angle) * t) + phase)
-            height = height + 0.28 * wave / frequency**1.2
+            height = height + 0.3 * wave / frequency**1.7
         return np.stack([s, height, -t], axis=-1)
 
     grid = np.linspace(-4, 4, 81)
