@@ -92,13 +92,13 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
         # --------------------- Configure loop state ----------------------
 
-        ray = mi.Ray3f(ray_)                   # Current ray
-        cone = RayCone.from_ray(ray_)          # Its width, for footprints
-        active = mi.Bool(active)               # Active SIMD lanes
-        L = mi.Spectrum(0)                     # Radiance accumulator
-        β = mi.Spectrum(1)                     # Path throughput weight
-        η = mi.Float(1)                        # Index of refraction
-        depth = mi.UInt32(0)                   # Depth of current vertex
+        ray = mi.Ray3f(ray_)  # Current ray
+        cone = RayCone.from_ray(ray_)  # Its width, for footprints
+        active = mi.Bool(active)  # Active SIMD lanes
+        L = mi.Spectrum(0)  # Radiance accumulator
+        β = mi.Spectrum(1)  # Path throughput weight
+        η = mi.Float(1)  # Index of refraction
+        depth = mi.UInt32(0)  # Depth of current vertex
         bsdf_ctx = mi.BSDFContext()
 
         # Variables caching information from the previous bounce
@@ -120,9 +120,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
 
         # As part of the loop's state, the sensor's ray would lose its flag has_differentials
-        while dr.hint(
-            active, max_iterations=self.max_depth, exclude=[ray_], label="glint_path"
-        ):
+        while dr.hint(active, max_iterations=self.max_depth, exclude=[ray_], label="glint_path"):
             # The curvature of the surface is what bends ray cones
             si = curved_interaction(pi, ray)
 

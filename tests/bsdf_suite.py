@@ -99,8 +99,9 @@ def density(bsdf: mi.BSDF, view: View, s: mi.Vector2f) -> mi.Float:
     return bsdf.pdf(mi.BSDFContext(), si, wo) * 4 * dr.abs(dr.dot(wo, m)) / m.z
 
 
-def mass_in_bins(bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 12,
-                 repetitions: int = 8) -> tuple[np.ndarray, np.ndarray]:
+def mass_in_bins(
+    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 12, repetitions: int = 8
+) -> tuple[np.ndarray, np.ndarray]:
     """Mass of D in each of ``res``² bins over ``bounds``, and the standard error of the quadrature.
 
     D jumps at the edges of triangles and of the kernel, so the quadrature is by jittered points
@@ -113,8 +114,9 @@ def mass_in_bins(bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: in
     runs = []
     for _ in range(repetitions):
         x, y = ((k + rng.random((n, n))) / n for k in (column, row))
-        s = mi.Vector2f(*(np.float32(lower[i] + p.ravel() * (upper - lower)[i])
-                          for i, p in enumerate((x, y))))
+        s = mi.Vector2f(
+            *(np.float32(lower[i] + p.ravel() * (upper - lower)[i]) for i, p in enumerate((x, y)))
+        )
         values = np.array(density(bsdf, view, s), np.float64)
         runs.append(values.reshape(res, points, res, points).mean(axis=(1, 3)))
     runs = np.array(runs) * np.prod((upper - lower) / res)
@@ -126,8 +128,9 @@ def mass_in_bins(bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: in
 # --------------------------------------------------------------------------------------------------
 
 
-def assert_distributed(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray,
-                       test_count: int) -> None:
+def assert_distributed(
+    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, test_count: int
+) -> None:
     """Pearson's χ² test of ``counts`` in bins, out of ``total``, against the ``mass`` of each bin.
 
     What the quadrature errs (``error``, a standard deviation) adds to the variance of a count. The
@@ -138,16 +141,24 @@ def assert_distributed(counts: np.ndarray, total: int, mass: np.ndarray, error: 
     counts, expected = counts.ravel()[order], total * mass.ravel()[order]
     variance = expected + (total * error.ravel()[order]) ** 2
     pooled = np.searchsorted(np.cumsum(expected), 5) + 1
-    counts, expected, variance = (np.append(x[pooled:], x[:pooled].sum())
-                                  for x in (counts, expected, variance))
+    counts, expected, variance = (
+        np.append(x[pooled:], x[:pooled].sum()) for x in (counts, expected, variance)
+    )
     statistic = ((counts - expected) ** 2 / variance).sum()
     p_value = scipy.stats.chi2.sf(statistic, len(counts))
     assert p_value > 1 - (1 - SIGNIFICANCE) ** (1 / test_count), (
-        f"chi2 = {statistic} for {len(counts)} bins, p = {p_value}")
+        f"chi2 = {statistic} for {len(counts)} bins, p = {p_value}"
+    )
 
 
-def check_chi2(bsdf: mi.BSDF, view: View, bounds: Bounds, test_count: int, samples: int = 100_000,
-               res: int = 25) -> None:
+def check_chi2(
+    bsdf: mi.BSDF,
+    view: View,
+    bounds: Bounds,
+    test_count: int,
+    samples: int = 100_000,
+    res: int = 25,
+) -> None:
     """``sample`` draws from the density that ``pdf`` states, which integrates to one.
 
     ``bounds`` is a rectangle of the disk that holds all normals; the view must be such that nothing
@@ -167,15 +178,23 @@ def check_chi2(bsdf: mi.BSDF, view: View, bounds: Bounds, test_count: int, sampl
     assert abs(mass.sum() - 1) <= 4 * np.sqrt((error**2).sum()) + 1e-4, mass.sum()
 
 
-def check_against_reference(bsdf: mi.BSDF, normal_map: NormalMap, view: View, test_count: int,
-                            samples: int = 200_000, res: int = 25, seed: int = 1,
-                            **options) -> None:
+def check_against_reference(
+    bsdf: mi.BSDF,
+    normal_map: NormalMap,
+    view: View,
+    test_count: int,
+    samples: int = 200_000,
+    res: int = 25,
+    seed: int = 1,
+    **options,
+) -> None:
     """D is the density of :func:`~glintbsdf.reference.binned_pndf` within its statistical error.
 
     ``options`` go to the reference: kernel, epsilon, …
     """
-    reference = binned_pndf(normal_map, view.uv, view.covariance(), res=res, samples=samples,
-                            seed=seed, **options)
+    reference = binned_pndf(
+        normal_map, view.uv, view.covariance(), res=res, samples=samples, seed=seed, **options
+    )
     counts = reference.density * reference.bin_area * samples
     mass, error = mass_in_bins(bsdf, view, reference.bounds, res)
     assert_distributed(counts, samples, mass, error, test_count)
@@ -218,8 +237,14 @@ def check_horizon(bsdf: mi.BSDF, view: View, count: int = 500) -> None:
     ctx, mirrored, horizontal = mi.BSDFContext(), mi.Vector3f(1, 1, -1), mi.Vector3f(1, 0, 0)
     si, bs, _ = sample(bsdf, view, count)
     up = mi.Vector3f(bs.wo.x, bs.wo.y, dr.abs(bs.wo.z))
-    for wi, wo in ((si.wi, up * mirrored), (si.wi * mirrored, up), (-si.wi, -up), (si.wi, -si.wi),
-                   (horizontal, up), (si.wi, horizontal)):
+    for wi, wo in (
+        (si.wi, up * mirrored),
+        (si.wi * mirrored, up),
+        (-si.wi, -up),
+        (si.wi, -si.wi),
+        (horizontal, up),
+        (si.wi, horizontal),
+    ):
         below = view.interaction(count)
         below.wi = wi
         value, pdf = bsdf.eval_pdf(ctx, below, wo)
@@ -233,12 +258,20 @@ def check_finite(bsdf: mi.BSDF, view: View, count: int = 200) -> None:
     si, bs, weight = sample(bsdf, view, count)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
     u = random_numbers(count, 2, seed=1)
-    elsewhere = bsdf.eval_pdf(mi.BSDFContext(), si, mi.warp.square_to_uniform_hemisphere(
-        mi.Point2f(u[0], u[1])))
+    elsewhere = bsdf.eval_pdf(
+        mi.BSDFContext(), si, mi.warp.square_to_uniform_hemisphere(mi.Point2f(u[0], u[1]))
+    )
     albedo = bsdf.eval_diffuse_reflectance(si)
     assert dr.all(dr.isfinite(bs.wo), axis=None)
-    for x in (intensity(weight), bs.pdf, intensity(value), pdf, intensity(elsewhere[0]),
-              elsewhere[1], intensity(albedo)):
+    for x in (
+        intensity(weight),
+        bs.pdf,
+        intensity(value),
+        pdf,
+        intensity(elsewhere[0]),
+        elsewhere[1],
+        intensity(albedo),
+    ):
         assert dr.all(dr.isfinite(x) & (x >= 0), axis=None)
 
 

@@ -27,9 +27,12 @@ class Builder:
     def __init__(self, seed=0):
         self.calls = 0
         rng = np.random.default_rng(seed)
-        self.arrays = {"floats": rng.normal(size=(3, 50, 2)).astype(np.float32),
-                       "offsets": rng.integers(0, 1 << 40, 1000),
-                       "empty": np.zeros((0, 4), np.uint8), "scalar": np.array(2.5)}
+        self.arrays = {
+            "floats": rng.normal(size=(3, 50, 2)).astype(np.float32),
+            "offsets": rng.integers(0, 1 << 40, 1000),
+            "empty": np.zeros((0, 4), np.uint8),
+            "scalar": np.array(2.5),
+        }
 
     def __call__(self):
         self.calls += 1
@@ -80,8 +83,9 @@ def test_damaged_file_is_built_again(folder):
     damaged = [content[:length] for length in (0, 1, 4, 100, len(content) // 2, len(content) - 1)]
     header, values = content.index(b"NUMPY"), content.index(builder.arrays["floats"].tobytes())
     for position in (0, header, header + 20, values, values + 1000, len(content) - 30):
-        damaged.append(content[:position] + bytes([content[position] ^ 0x55])
-                       + content[position + 1:])
+        damaged.append(
+            content[:position] + bytes([content[position] ^ 0x55]) + content[position + 1 :]
+        )
     damaged += [b"\x93NUMPY", b"\x80\x04K\x01.", b"not a file of arrays"]
     for built_before, broken in enumerate(damaged, start=1):
         path.write_bytes(broken)
@@ -102,8 +106,10 @@ def test_unwritable_directory_warns_once(tmp_path, monkeypatch):
     assert len(caught) == 1 and builder.calls == 2
 
 
-@pytest.mark.skipif(sys.platform == "win32" or not hasattr(os, "geteuid") or os.geteuid() == 0,
-                    reason="root may write anywhere")
+@pytest.mark.skipif(
+    sys.platform == "win32" or not hasattr(os, "geteuid") or os.geteuid() == 0,
+    reason="root may write anywhere",
+)
 def test_read_only_cache_is_read(folder):
     builder = Builder()
     cache.load_or_build("key", builder)
@@ -174,8 +180,9 @@ def test_old_files_go(folder, monkeypatch):
 def hammer(seed):
     """Write and read one key over and over; any mixture of two files would show."""
     for _ in range(30):
-        arrays = cache.load_or_build("shared", lambda: {
-            name: np.full(100_000, 7.0) for name in ("first", "second")})
+        arrays = cache.load_or_build(
+            "shared", lambda: {name: np.full(100_000, 7.0) for name in ("first", "second")}
+        )
         assert all((array == 7).all() and array.size == 100_000 for array in arrays.values())
         for path in cache.directory().glob("*.npz"):
             path.unlink(missing_ok=True)

@@ -41,8 +41,12 @@ def interactions(seed: int, count: int) -> mi.SurfaceInteraction3f:
 def test_partials_give_the_full_covariance(variant):
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.duv_dx, si.duv_dy = mi.Vector2f(0.03, 0.01), mi.Vector2f(-0.02, 0.04)
-    expected = 0.5**2 * np.array([[0.03**2 + 0.02**2, 0.03 * 0.01 - 0.02 * 0.04],
-                                  [0.03 * 0.01 - 0.02 * 0.04, 0.01**2 + 0.04**2]])
+    expected = 0.5**2 * np.array(
+        [
+            [0.03**2 + 0.02**2, 0.03 * 0.01 - 0.02 * 0.04],
+            [0.03 * 0.01 - 0.02 * 0.04, 0.01**2 + 0.04**2],
+        ]
+    )
     assert np.allclose(covariance(Footprint.from_interaction(si, 0.5, 0.1)), expected, rtol=1e-6)
 
 
@@ -76,13 +80,19 @@ def test_cone_is_the_ellipse_of_a_round_beam(variant):
 
 def test_cone_agrees_with_ray_differentials(variant):
     """Across the middle of an oblique image, a square pixel is a cone of its own angle."""
-    scene = mi.load_dict({
-        "type": "scene",
-        "plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([3, 2, 1])},
-        "sensor": {"type": "perspective", "fov": 20, "near_clip": 1e-3,
-                   "to_world": mi.ScalarTransform4f().look_at([0, -4, 2], [0, 0, 0], [0, 0, 1]),
-                   "film": {"type": "hdrfilm", "width": 512, "height": 512}},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "plane": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([3, 2, 1])},
+            "sensor": {
+                "type": "perspective",
+                "fov": 20,
+                "near_clip": 1e-3,
+                "to_world": mi.ScalarTransform4f().look_at([0, -4, 2], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 512, "height": 512},
+            },
+        }
+    )
     ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     spread = 2 * np.tan(np.radians(10)) / 512

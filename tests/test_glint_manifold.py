@@ -40,9 +40,14 @@ DENSITY_TESTS = 2 * (len(KERNELS) * len(MAPS) + len(STIFF_MAPS))
 
 
 def describe(normal_map: NormalMap, **parameters) -> dict:
-    return {"type": "glint_manifold", "data": mi.TensorXf(normal_map.normals),
-            "wrap_mode": normal_map.wrap_mode, "footprint_sigma": 1.0, "masking": "none",
-            **parameters}
+    return {
+        "type": "glint_manifold",
+        "data": mi.TensorXf(normal_map.normals),
+        "wrap_mode": normal_map.wrap_mode,
+        "footprint_sigma": 1.0,
+        "masking": "none",
+        **parameters,
+    }
 
 
 def load(normal_map: NormalMap, **parameters) -> mi.BSDF:
@@ -57,8 +62,9 @@ def load(normal_map: NormalMap, **parameters) -> mi.BSDF:
 def check_density(normal_map: NormalMap, kernel: str, view: View) -> None:
     bsdf = load(normal_map, kernel=kernel, epsilon=EPSILON)
     suite.check_chi2(bsdf, view, normal_bounds(normal_map, EPSILON), DENSITY_TESTS)
-    suite.check_against_reference(bsdf, normal_map, view, DENSITY_TESTS,
-                                  kernel=kernel, epsilon=EPSILON)
+    suite.check_against_reference(
+        bsdf, normal_map, view, DENSITY_TESTS, kernel=kernel, epsilon=EPSILON
+    )
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -89,9 +95,12 @@ def test_to_uv_moves_the_footprint(variant):
     moved, plain = load(MAPS["isotropic"], to_uv=to_uv), load(MAPS["isotropic"])
     matrix = np.array(to_uv.matrix)
     linear, offset = matrix[:2, :2], matrix[:2, 3]
-    view = replace(RESOLVED, uv=tuple((linear @ RESOLVED.uv + offset).tolist()),
-                   du=tuple((linear @ RESOLVED.du).tolist()),
-                   dv=tuple((linear @ RESOLVED.dv).tolist()))
+    view = replace(
+        RESOLVED,
+        uv=tuple((linear @ RESOLVED.uv + offset).tolist()),
+        du=tuple((linear @ RESOLVED.du).tolist()),
+        dv=tuple((linear @ RESOLVED.dv).tolist()),
+    )
     si, bs, _ = suite.sample(plain, view, 500)
     expected = plain.pdf(mi.BSDFContext(), si, bs.wo)
     actual = moved.pdf(mi.BSDFContext(), RESOLVED.interaction(500), bs.wo)
@@ -147,14 +156,18 @@ def test_masking_is_part_of_the_value(variant):
     si, bs, _ = suite.sample(unmasked, view, 500)
     value = unmasked.eval(mi.BSDFContext(), si, bs.wo)
     correlated, separable = (
-        load(MAPS["isotropic"], masking="beckmann", height_correlated=flag)
-        .eval(mi.BSDFContext(), si, bs.wo) for flag in (True, False))
+        load(MAPS["isotropic"], masking="beckmann", height_correlated=flag).eval(
+            mi.BSDFContext(), si, bs.wo
+        )
+        for flag in (True, False)
+    )
     assert dr.all((separable <= correlated) & (correlated <= value), axis=None)
     assert dr.any(separable < 0.9999 * correlated, axis=None)
 
 
-@pytest.mark.parametrize("key", ["data", "footprint_sigma", "specular_reflectance.value",
-                                 "eta.value", "k.value"])
+@pytest.mark.parametrize(
+    "key", ["data", "footprint_sigma", "specular_reflectance.value", "eta.value", "k.value"]
+)
 def test_derivatives(variant, key):
     bsdf = load(MAPS["isotropic"], masking="beckmann", eta=0.5, k=2.0, specular_reflectance=0.5)
     suite.check_derivative(bsdf, RESOLVED, key)
@@ -171,8 +184,10 @@ def test_albedo(variant):
     gold = load(MAPS["isotropic"], material="Au", specular_reflectance=0.5)
     albedo = gold.eval_diffuse_reflectance(si)
     params = mi.traverse(mi.load_dict({"type": "conductor", "material": "Au"}))
-    expected = [mi.fresnel_conductor(si.wi.z, mi.Complex2f(eta, k))[0] for eta, k in
-                zip(params["eta.value"], params["k.value"], strict=True)]
+    expected = [
+        mi.fresnel_conductor(si.wi.z, mi.Complex2f(eta, k))[0]
+        for eta, k in zip(params["eta.value"], params["k.value"], strict=True)
+    ]
     assert dr.allclose(albedo, 0.5 * mi.Color3f(expected))
 
 
@@ -195,8 +210,9 @@ BAD_OWN_PARAMETERS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "parameter"), suite.BAD_PARAMETERS + BAD_OWN_PARAMETERS,
-                         ids=str)
+@pytest.mark.parametrize(
+    ("changes", "parameter"), suite.BAD_PARAMETERS + BAD_OWN_PARAMETERS, ids=str
+)
 def test_bad_parameters(variant, changes, parameter):
     suite.check_rejects(describe(MAPS["isotropic"]), changes, parameter)
 
@@ -219,8 +235,11 @@ def test_unknown_parameter(variant):
 
 
 def test_message(variant):
-    with pytest.raises(Exception, match=r'glint_manifold: "kernel" must be one of gaussian, disk, '
-                                        r'box \(got "gauss"\)'):
+    with pytest.raises(
+        Exception,
+        match=r'glint_manifold: "kernel" must be one of gaussian, disk, '
+        r'box \(got "gauss"\)',
+    ):
         load(MAPS["isotropic"], kernel="gauss")
 
 
@@ -241,14 +260,24 @@ def test_xml_and_dict_agree(variant, tmp_path):
                 <boolean name="height_correlated" value="false"/>
             </bsdf>
             <shape type="rectangle"><ref id="glints"/></shape>
-        </scene>""")
+        </scene>"""
+    )
     from_xml = mi.load_file(str(tmp_path / "scene.xml")).shapes()[0].bsdf()
-    from_dict = mi.load_dict({
-        "type": "glint_manifold", "data": mi.TensorXf(height[..., None] / 255.0),
-        "map_type": "height", "height_scale": 0.5, "wrap_mode": "mirror",
-        "to_uv": mi.ScalarTransform4f().translate([0.25, 0, 0]).scale([2, 3, 1]), "kernel": "disk",
-        "footprint_sigma": 1, "material": "Cu", "height_correlated": False,
-        "specular_reflectance": {"type": "rgb", "value": [0.9, 0.8, 0.7]}})
+    from_dict = mi.load_dict(
+        {
+            "type": "glint_manifold",
+            "data": mi.TensorXf(height[..., None] / 255.0),
+            "map_type": "height",
+            "height_scale": 0.5,
+            "wrap_mode": "mirror",
+            "to_uv": mi.ScalarTransform4f().translate([0.25, 0, 0]).scale([2, 3, 1]),
+            "kernel": "disk",
+            "footprint_sigma": 1,
+            "material": "Cu",
+            "height_correlated": False,
+            "specular_reflectance": {"type": "rgb", "value": [0.9, 0.8, 0.7]},
+        }
+    )
     si, bs, weight = suite.sample(from_dict, RESOLVED, 200)
     _, bs_xml, weight_xml = suite.sample(from_xml, RESOLVED, 200)
     assert dr.allclose(bs.wo, bs_xml.wo, atol=1e-5)
@@ -256,13 +285,23 @@ def test_xml_and_dict_agree(variant, tmp_path):
 
 
 def test_all_sources_give_the_same_map(variant, tmp_path):
-    normals = np.concatenate([MAPS["brushed"].normals,
-                              np.sqrt(1 - (MAPS["brushed"].normals**2).sum(2, keepdims=True))], 2)
+    normals = np.concatenate(
+        [
+            MAPS["brushed"].normals,
+            np.sqrt(1 - (MAPS["brushed"].normals ** 2).sum(2, keepdims=True)),
+        ],
+        2,
+    )
     bitmap = mi.Bitmap(normals.astype(np.float32))
     bitmap.write(str(tmp_path / "map.exr"))
-    bsdfs = [mi.load_dict({"type": "glint_manifold", "masking": "none", **source}) for source in (
-        {"data": mi.TensorXf(normals)}, {"bitmap": bitmap},
-        {"filename": str(tmp_path / "map.exr")})]
+    bsdfs = [
+        mi.load_dict({"type": "glint_manifold", "masking": "none", **source})
+        for source in (
+            {"data": mi.TensorXf(normals)},
+            {"bitmap": bitmap},
+            {"filename": str(tmp_path / "map.exr")},
+        )
+    ]
     for bsdf in bsdfs:
         assert np.allclose(np.array(mi.traverse(bsdf)["data"]), MAPS["brushed"].normals, atol=1e-6)
 
@@ -276,8 +315,9 @@ def test_changed_parameters_take_effect(variant):
     params["footprint_sigma"] = 0.5
     params["to_uv"] = mi.ScalarAffineTransform3f().scale([2, 1])
     params.update()
-    fresh = load(new, masking="beckmann", footprint_sigma=0.5,
-                 to_uv=mi.ScalarTransform4f().scale([2, 1, 1]))
+    fresh = load(
+        new, masking="beckmann", footprint_sigma=0.5, to_uv=mi.ScalarTransform4f().scale([2, 1, 1])
+    )
     view = replace(RESOLVED, wi=(1, 0, 0.5))
     si, bs, weight = suite.sample(bsdf, view, 200)
     _, bs_fresh, weight_fresh = suite.sample(fresh, view, 200)
@@ -306,23 +346,31 @@ def render(bsdf: dict, integrator: dict | None = None, from_below: bool = False)
     camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
     if from_below:
         camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": integrator or {"type": "path", "max_depth": 2, "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": camera,
-                   "film": {"type": "hdrfilm", "width": 24, "height": 24},
-                   "sampler": {"type": "independent", "sample_count": 16}},
-        "sky": {"type": "constant"},
-        "square": {"type": "rectangle", "bsdf": bsdf},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator or {"type": "path", "max_depth": 2, "hide_emitters": True},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": camera,
+                "film": {"type": "hdrfilm", "width": 24, "height": 24},
+                "sampler": {"type": "independent", "sample_count": 16},
+            },
+            "sky": {"type": "constant"},
+            "square": {"type": "rectangle", "bsdf": bsdf},
+        }
+    )
     image = np.array(mi.render(scene, seed=1))
     assert np.isfinite(image).all() and (image >= 0).all()
     return image
 
 
 def glints(**parameters) -> dict:
-    return {**describe(MAPS["isotropic"], masking="beckmann", footprint_sigma=0.5,
-                       pixel_spread=0.03), **parameters}
+    return {
+        **describe(MAPS["isotropic"], masking="beckmann", footprint_sigma=0.5, pixel_spread=0.03),
+        **parameters,
+    }
 
 
 def texture(value: list[float]) -> dict:
@@ -363,12 +411,18 @@ def test_albedo_image(variant):
 
 
 def test_prb_derivative(variant):
-    scene = mi.load_dict({
-        "type": "scene", "sky": {"type": "constant"},
-        "sensor": {"type": "perspective",
-                   "to_world": mi.ScalarTransform4f().look_at([0, -1, 2], [0, 0, 0], [0, 0, 1]),
-                   "film": {"type": "hdrfilm", "width": 8, "height": 8}},
-        "square": {"type": "rectangle", "bsdf": glints(specular_reflectance=0.5, id="glints")}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, -1, 2], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 8, "height": 8},
+            },
+            "square": {"type": "rectangle", "bsdf": glints(specular_reflectance=0.5, id="glints")},
+        }
+    )
     params = mi.traverse(scene)
     key = next(key for key in params.keys() if key.endswith("specular_reflectance.value"))
     dr.enable_grad(params[key])

@@ -18,30 +18,54 @@ def transform():
 def load_scene(**overrides):
     """Diffuse, rough and smooth metal, glass, a mask; area, point and environment light."""
     environment = mi.TensorXf(np.linspace(0, 1, 8 * 16 * 3, dtype=np.float32).reshape(8, 16, 3))
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": 40,
-            "to_world": transform().look_at([0, -6, 3], [0, 0, 0.5], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 24, "height": 16, "pixel_format": "rgba"},
-        },
-        "floor": {"type": "rectangle", "to_world": transform().scale(4),
-                  "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
-        "rough": {"type": "sphere", "center": [-1, 0, 0.7], "radius": 0.7,
-                  "bsdf": {"type": "roughconductor", "alpha": 0.2}},
-        "glass": {"type": "sphere", "center": [1, 0, 0.7], "radius": 0.7,
-                  "bsdf": {"type": "dielectric"}},
-        "mirror": {"type": "sphere", "center": [0, 1.5, 0.7], "radius": 0.7,
-                   "bsdf": {"type": "conductor"}},
-        "mask": {"type": "sphere", "center": [0, -1.5, 0.4], "radius": 0.3,
-                 "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "plastic"}}},
-        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": 5.0},
-                 "to_world": transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.7)},
-        "point": {"type": "point", "position": [2, -2, 3], "intensity": 4.0},
-        "environment": {"type": "envmap", "bitmap": mi.Bitmap(environment), "scale": 0.5},
-        **overrides,
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": transform().look_at([0, -6, 3], [0, 0, 0.5], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 24, "height": 16, "pixel_format": "rgba"},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": transform().scale(4),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+            },
+            "rough": {
+                "type": "sphere",
+                "center": [-1, 0, 0.7],
+                "radius": 0.7,
+                "bsdf": {"type": "roughconductor", "alpha": 0.2},
+            },
+            "glass": {
+                "type": "sphere",
+                "center": [1, 0, 0.7],
+                "radius": 0.7,
+                "bsdf": {"type": "dielectric"},
+            },
+            "mirror": {
+                "type": "sphere",
+                "center": [0, 1.5, 0.7],
+                "radius": 0.7,
+                "bsdf": {"type": "conductor"},
+            },
+            "mask": {
+                "type": "sphere",
+                "center": [0, -1.5, 0.4],
+                "radius": 0.3,
+                "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "plastic"}},
+            },
+            "lamp": {
+                "type": "rectangle",
+                "emitter": {"type": "area", "radiance": 5.0},
+                "to_world": transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.7),
+            },
+            "point": {"type": "point", "position": [2, -2, 3], "intensity": 4.0},
+            "environment": {"type": "envmap", "bitmap": mi.Bitmap(environment), "scale": 0.5},
+            **overrides,
+        }
+    )
 
 
 def render(scene, integrator, **parameters):
@@ -58,14 +82,18 @@ def assert_same_image(scene, **parameters):
     assert np.allclose(image, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("parameters", [
-    {},
-    {"max_depth": 0},
-    {"max_depth": 1},
-    {"max_depth": 3},
-    {"rr_depth": 1},
-    {"hide_emitters": True},
-], ids=str)
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {},
+        {"max_depth": 0},
+        {"max_depth": 1},
+        {"max_depth": 3},
+        {"rr_depth": 1},
+        {"hide_emitters": True},
+    ],
+    ids=str,
+)
 def test_equals_path_sample_by_sample(variant, parameters):
     """Stronger than equality in expectation: the same random numbers give the same image."""
     assert_same_image(load_scene(), **parameters)
@@ -162,9 +190,14 @@ def probe(shapes, ray, quantity, spp=1):
     """What ``glint_path`` hands to the BSDF of ``shapes["probe"]``: (N, 2), and where (N,)."""
     register_probe()
     target = {**shapes["probe"], "bsdf": {"type": "footprint_probe", "quantity": quantity}}
-    scene = mi.load_dict({
-        "type": "scene", **shapes, "probe": target, "sky": {"type": "constant"},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            **shapes,
+            "probe": target,
+            "sky": {"type": "constant"},
+        }
+    )
     sampler = mi.load_dict({"type": "independent", "sample_count": spp})
     sampler.seed(0, dr.width(ray))
     integrator = mi.load_dict({"type": "glint_path", "max_depth": 6})
@@ -191,11 +224,15 @@ def traced_partials(shapes, ray):
 
 def sensor_rays(count):
     """Rays of a camera above the origin, tilted, with the differentials of one pixel of 512²."""
-    sensor = mi.load_dict({
-        "type": "perspective", "fov": 25, "near_clip": 1e-4,
-        "to_world": transform().look_at([0.3, -2, 5], [0, 0, 0], [0, 1, 0.2]),
-        "film": {"type": "hdrfilm", "width": 512, "height": 512},
-    })
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 25,
+            "near_clip": 1e-4,
+            "to_world": transform().look_at([0.3, -2, 5], [0, 0, 0], [0, 1, 0.2]),
+            "film": {"type": "hdrfilm", "width": 512, "height": 512},
+        }
+    )
     position = np.random.default_rng(11).uniform(0.45, 0.55, (2, count)).astype(np.float32)
     return sensor.sample_ray_differential(0.0, 0.5, mi.Point2f(position), mi.Point2f(0.5))[0]
 
@@ -214,8 +251,10 @@ def tilted(angle_x, angle_y):
 
 def overhead():
     """A large square above camera and mirrors, facing down."""
-    return {"type": "rectangle",
-            "to_world": transform().translate([0, 0, 7]) @ tilted(170, 10).scale(20)}
+    return {
+        "type": "rectangle",
+        "to_world": transform().translate([0, 0, 7]) @ tilted(170, 10).scale(20),
+    }
 
 
 def bumpy_mesh(with_uv=True):
@@ -231,8 +270,14 @@ def bumpy_mesh(with_uv=True):
 
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "conductor"})
-    mesh = mi.Mesh("bumpy", len(position), len(faces), has_vertex_normals=True,
-                   has_vertex_texcoords=with_uv, props=properties)
+    mesh = mi.Mesh(
+        "bumpy",
+        len(position),
+        len(faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=with_uv,
+        props=properties,
+    )
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = position.ravel().astype(np.float32)
     parameters["vertex_normals"] = normal.ravel().astype(np.float32)
@@ -260,22 +305,40 @@ def test_first_hit_is_exact(variant, shape):
 def test_footprint_behind_a_bounce(variant, bounce):
     """Against the neighbouring rays, traced: mirrors of every curvature, and refraction."""
     mirror, glass = {"type": "conductor"}, {"type": "dielectric", "int_ior": 1.3}
-    below = {"type": "rectangle",
-             "to_world": transform().translate([0, 0, -1.5]) @ tilted(20, 10).scale(3)}
+    below = {
+        "type": "rectangle",
+        "to_world": transform().translate([0, 0, -1.5]) @ tilted(20, 10).scale(3),
+    }
     tilt = tilted(25, 10)
     shapes = {
-        "plane": {"bounce": {"type": "rectangle", "to_world": tilt.scale(2), "bsdf": mirror},
-                  "probe": overhead()},
-        "sphere": {"bounce": {"type": "sphere", "radius": 1.5, "bsdf": mirror},
-                   "probe": overhead()},
-        "cylinder": {"bounce": {"type": "cylinder", "p0": [-3, 0, 0], "p1": [3, 0.5, 0],
-                                "radius": 1.5, "bsdf": mirror}, "probe": overhead()},
+        "plane": {
+            "bounce": {"type": "rectangle", "to_world": tilt.scale(2), "bsdf": mirror},
+            "probe": overhead(),
+        },
+        "sphere": {
+            "bounce": {"type": "sphere", "radius": 1.5, "bsdf": mirror},
+            "probe": overhead(),
+        },
+        "cylinder": {
+            "bounce": {
+                "type": "cylinder",
+                "p0": [-3, 0, 0],
+                "p1": [3, 0.5, 0],
+                "radius": 1.5,
+                "bsdf": mirror,
+            },
+            "probe": overhead(),
+        },
         "mesh": {"bounce": bumpy_mesh(), "probe": overhead()},
-        "slab": {"bounce": {"type": "cube", "to_world": tilt.scale([2, 2, 0.4]), "bsdf": glass},
-                 "probe": below},
+        "slab": {
+            "bounce": {"type": "cube", "to_world": tilt.scale([2, 2, 0.4]), "bsdf": glass},
+            "probe": below,
+        },
         "lens": {"bounce": {"type": "sphere", "radius": 1, "bsdf": glass}, "probe": below},
-        "null": {"bounce": {"type": "rectangle", "to_world": tilt, "bsdf": {"type": "null"}},
-                 "probe": below},
+        "null": {
+            "bounce": {"type": "rectangle", "to_world": tilt, "bsdf": {"type": "null"}},
+            "probe": below,
+        },
     }[bounce]
     ray = sensor_rays(400)
     error = errors(partials(shapes, ray), traced_partials(shapes, ray))
@@ -297,12 +360,20 @@ def test_footprint_behind_a_mesh_without_uv(variant):
 def test_footprint_behind_an_instance(variant):
     """An instanced mesh mirrors like a flat one: finite, and a footprint of the right size."""
     group = {"type": "shapegroup", "mesh": bumpy_mesh()}
-    shapes = {"group": group, "probe": overhead(),
-              "bounce": {"type": "instance", "to_world": transform().scale(2), "group": {
-                  "type": "ref", "id": "group"}}}
+    shapes = {
+        "group": group,
+        "probe": overhead(),
+        "bounce": {
+            "type": "instance",
+            "to_world": transform().scale(2),
+            "group": {"type": "ref", "id": "group"},
+        },
+    }
     result = partials(shapes, sensor_rays(100))
-    flat = partials({"bounce": {"type": "rectangle", "bsdf": {"type": "conductor"}},
-                     "probe": overhead()}, sensor_rays(100))
+    flat = partials(
+        {"bounce": {"type": "rectangle", "bsdf": {"type": "conductor"}}, "probe": overhead()},
+        sensor_rays(100),
+    )
     ratio = np.sqrt(np.abs(np.linalg.det(result) / np.linalg.det(flat)))
     assert np.all((ratio > 0.5) & (ratio < 2))
 
@@ -324,9 +395,10 @@ def test_lobe_spreads_the_cone(variant, spp):
     ray = mi.RayDifferential3f(mi.Ray3f(dr.zeros(mi.Point3f, count) + [0, 0, 1], [0, 0, -1]))
     shapes = {
         "bounce": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 1.0}},
-        "probe": {"type": "rectangle",
-                  "to_world": transform().translate([0, 0, height]).rotate([1, 0, 0], 180)
-                  .scale(scale)},
+        "probe": {
+            "type": "rectangle",
+            "to_world": transform().translate([0, 0, height]).rotate([1, 0, 0], 180).scale(scale),
+        },
     }
     offset = (probe(shapes, ray, "uv", spp) - 0.5) * 2 * scale
     squared_distance = height**2 + (offset**2).sum(axis=1)

@@ -55,8 +55,9 @@ def test_beckmann_lambda_is_the_integral_that_defines_it(variant, alpha):
         sigma = np.hypot(alpha[0] * np.cos(p), alpha[1] * np.sin(p)) / np.sqrt(2)
         c = 1 / np.tan(theta)
         slopes = scipy.stats.norm(scale=sigma)
-        integral, _ = scipy.integrate.quad(lambda x, c=c, p=slopes: (x - c) * p.pdf(x),
-                                           c, c + 12 * sigma)
+        integral, _ = scipy.integrate.quad(
+            lambda x, c=c, p=slopes: (x - c) * p.pdf(x), c, c + 12 * sigma
+        )
         # float32: the two terms of Λ cancel to 1e-7 of each.
         assert value == pytest.approx(integral / c, rel=2e-4, abs=2e-7)
 
@@ -110,8 +111,9 @@ def test_mueller_matrix_is_that_of_roughconductor(each_variant):
     if not mi.is_polarized:
         pytest.skip("needs a polarised variant")
     rough = mi.load_dict({"type": "roughconductor", "material": "Au", "alpha": 0.8})
-    ours = mi.load_dict({"type": "glint_manifold", "data": mi.TensorXf(maps.isotropic(8).normals),
-                         "material": "Au"})
+    ours = mi.load_dict(
+        {"type": "glint_manifold", "data": mi.TensorXf(maps.isotropic(8).normals), "material": "Au"}
+    )
     wi, wo = directions(50, 7), directions(50, 8)
     m = microfacet.half_vector(wi, wo)
     si = dr.zeros(mi.SurfaceInteraction3f, 50)
@@ -119,8 +121,11 @@ def test_mueller_matrix_is_that_of_roughconductor(each_variant):
     reflectance = np.array(ours.fresnel.reflectance(dr.dot(wo, m), si, True))
     for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
         expected = np.array(rough.eval(mi.BSDFContext(mode), si, wo))
-        actual = np.array(microfacet.mueller_reflection(
-            ours.fresnel.index(si, True), mi.UnpolarizedSpectrum(0.5), mode, wi, wo, m))
+        actual = np.array(
+            microfacet.mueller_reflection(
+                ours.fresnel.index(si, True), mi.UnpolarizedSpectrum(0.5), mode, wi, wo, m
+            )
+        )
         assert np.allclose(actual[0, 0], 0.5 * reflectance, rtol=1e-4)
         seen = expected[0, 0, 0] > 1e-6
         assert seen.sum() > 25

@@ -34,14 +34,16 @@ def encode(normals, dtype):
 
 
 def write_exr(path, channels):
-    OpenEXR.File({"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION},
-                 {name: np.ascontiguousarray(values) for name, values in channels.items()}
-                 ).write(str(path))
+    OpenEXR.File(
+        {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION},
+        {name: np.ascontiguousarray(values) for name, values in channels.items()},
+    ).write(str(path))
 
 
 # -------------------------------------------------------------------------------------------------
 # Conventions
 # -------------------------------------------------------------------------------------------------
+
 
 def test_height_leans_against_its_gradient():
     rows, columns = np.mgrid[0:12, 0:20]
@@ -57,8 +59,9 @@ def test_height_leans_against_its_gradient():
     np.testing.assert_allclose(normal_map.normals, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("wrap_mode, border_slope", [("repeat", -3.0), ("mirror", 0.5),
-                                                     ("clamp", 0.5)])
+@pytest.mark.parametrize(
+    "wrap_mode, border_slope", [("repeat", -3.0), ("mirror", 0.5), ("clamp", 0.5)]
+)
 def test_wrap_mode_decides_the_slope_at_the_border(wrap_mode, border_slope):
     ramp = np.broadcast_to(np.arange(8.0), (3, 8))
     for axis, height in ((0, ramp), (1, ramp.T)):
@@ -114,9 +117,11 @@ def test_unsigned_integers_are_fractions(dtype):
     np.testing.assert_allclose(decoded, normals[..., :2], atol=max(2 * step, 1e-7))
     height = random_heights()
     stored = np.round(height * np.iinfo(dtype).max).astype(dtype)
-    np.testing.assert_allclose(NormalMap.from_array(stored).normals,
-                               NormalMap.from_array(stored / np.iinfo(dtype).max).normals,
-                               atol=1e-7)
+    np.testing.assert_allclose(
+        NormalMap.from_array(stored).normals,
+        NormalMap.from_array(stored / np.iinfo(dtype).max).normals,
+        atol=1e-7,
+    )
 
 
 def test_map_is_a_copy_that_cannot_change():
@@ -132,8 +137,13 @@ def test_content_hash_follows_content():
     normals = random_normals((4, 6))[..., :2].astype(np.float32)
     changed = normals.copy()
     changed[3, 5, 1] = np.nextafter(changed[3, 5, 1], np.float32(1))
-    maps = [NormalMap(normals), NormalMap(normals, "mirror"), NormalMap(changed),
-            NormalMap(normals.reshape(6, 4, 2)), NormalMap(np.asfortranarray(normals[::-1]))]
+    maps = [
+        NormalMap(normals),
+        NormalMap(normals, "mirror"),
+        NormalMap(changed),
+        NormalMap(normals.reshape(6, 4, 2)),
+        NormalMap(np.asfortranarray(normals[::-1])),
+    ]
     assert len({normal_map.content_hash for normal_map in maps}) == len(maps)
     assert NormalMap(np.asfortranarray(normals)).content_hash == maps[0].content_hash
 
@@ -149,6 +159,7 @@ def test_roughness_is_that_of_the_slopes():
 # -------------------------------------------------------------------------------------------------
 # Sources
 # -------------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("dtype, tolerance", [(np.float16, 5e-4), (np.float32, 1e-7)])
 @pytest.mark.parametrize("names", ["RGB", "XYZ", "RG", "XY"])
@@ -170,19 +181,22 @@ def test_exr_layers_are_not_mixed(tmp_path):
     channels = {f"b.{name}": normals[..., i] for i, name in enumerate("XYZ")}
     for extra in ({"Z": other}, {"a.X": other, "a.Y": other}, {"c.X": other, "c.Z": other}):
         write_exr(tmp_path / "map.exr", channels | extra)
-        np.testing.assert_allclose(NormalMap.load(tmp_path / "map.exr").normals, normals[..., :2],
-                                   atol=1e-7)
+        np.testing.assert_allclose(
+            NormalMap.load(tmp_path / "map.exr").normals, normals[..., :2], atol=1e-7
+        )
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
-@pytest.mark.parametrize("names", [["Y"], ["height"], ["Y", "A"], ["R", "G", "B"],
-                                   ["R", "G", "B", "A"]])
+@pytest.mark.parametrize(
+    "names", [["Y"], ["height"], ["Y", "A"], ["R", "G", "B"], ["R", "G", "B", "A"]]
+)
 def test_exr_heights(tmp_path, dtype, names):
     height = random_heights().astype(dtype)
     write_exr(tmp_path / "map.exr", {name: height for name in names})
     loaded = NormalMap.load(tmp_path / "map.exr", height_scale=4)
-    np.testing.assert_array_equal(loaded.normals,
-                                  NormalMap.from_array(height, height_scale=4).normals)
+    np.testing.assert_array_equal(
+        loaded.normals, NormalMap.from_array(height, height_scale=4).normals
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -197,23 +211,26 @@ def test_integer_files_lose_nothing(tmp_path, dtype, suffix):
             mi.Bitmap(data).write(str(path))
         else:
             skimage.io.imsave(path, data, check_contrast=False)
-        np.testing.assert_array_equal(NormalMap.load(path).normals,
-                                      NormalMap.from_array(data).normals)
+        np.testing.assert_array_equal(
+            NormalMap.load(path).normals, NormalMap.from_array(data).normals
+        )
 
 
 def test_png_of_grey_and_alpha_is_a_height(tmp_path):
     height = np.round(random_heights() * 255).astype(np.uint8)
     data = np.stack((height, np.full_like(height, 9)), axis=2)
     mi.Bitmap(data, mi.Bitmap.PixelFormat.YA).write(str(tmp_path / "map.png"))
-    np.testing.assert_array_equal(NormalMap.load(tmp_path / "map.png").normals,
-                                  NormalMap.from_array(height).normals)
+    np.testing.assert_array_equal(
+        NormalMap.load(tmp_path / "map.png").normals, NormalMap.from_array(height).normals
+    )
 
 
 def test_floating_point_tiff(tmp_path):
     height = random_heights().astype(np.float32)
     skimage.io.imsave(tmp_path / "map.tif", height, check_contrast=False)
-    np.testing.assert_array_equal(NormalMap.load(tmp_path / "map.tif").normals,
-                                  NormalMap.from_array(height).normals)
+    np.testing.assert_array_equal(
+        NormalMap.load(tmp_path / "map.tif").normals, NormalMap.from_array(height).normals
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32])
@@ -229,8 +246,10 @@ def test_bitmaps_are_raw(dtype):
     height = np.ascontiguousarray(data[..., 0])
     two = mi.Bitmap(np.stack((height, height), axis=2), mi.Bitmap.PixelFormat.YA)
     for bitmap in (mi.Bitmap(height), two):
-        np.testing.assert_array_equal(NormalMap.from_bitmap(bitmap, "height").normals,
-                                      NormalMap.from_array(height, "height").normals)
+        np.testing.assert_array_equal(
+            NormalMap.from_bitmap(bitmap, "height").normals,
+            NormalMap.from_array(height, "height").normals,
+        )
 
 
 def test_tensors(variant):
@@ -249,17 +268,21 @@ def test_tensors(variant):
 
 
 def test_readers_are_imported_when_needed_only():
-    code = ("import sys, glintbsdf.normalmap, glintbsdf.maps, glintbsdf.reference;"
-            "glintbsdf.maps.isotropic(8);"
-            "print([m for m in ('OpenEXR', 'skimage', 'matplotlib', 'PIL') if m in sys.modules])")
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
-                            check=True)
+    code = (
+        "import sys, glintbsdf.normalmap, glintbsdf.maps, glintbsdf.reference;"
+        "glintbsdf.maps.isotropic(8);"
+        "print([m for m in ('OpenEXR', 'skimage', 'matplotlib', 'PIL') if m in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert result.stdout.strip() == "[]"
 
 
 # -------------------------------------------------------------------------------------------------
 # What is refused
 # -------------------------------------------------------------------------------------------------
+
 
 def changed(array, *places, value):
     array = np.array(array)
@@ -269,36 +292,66 @@ def changed(array, *places, value):
 
 
 BAD_DATA = {
-    "empty": (np.zeros((0, 4, 3)), {}, "an H x W x C array .* (got \"0 x 4 x 3, float64\")"),
+    "empty": (np.zeros((0, 4, 3)), {}, 'an H x W x C array .* (got "0 x 4 x 3, float64")'),
     "no array": (None, {}, "an H x W x C array"),
-    "one axis": (np.zeros(9), {}, "an H x W x C array .* (got \"9, float64\")"),
+    "one axis": (np.zeros(9), {}, 'an H x W x C array .* (got "9, float64")'),
     "five channels": (np.zeros((4, 4, 5)), {}, "an H x W x C array"),
     "signed": (np.zeros((4, 4), np.int32), {}, "floating-point numbers or unsigned .*int32"),
     "complex": (np.zeros((4, 4), complex), {}, "floating-point numbers or unsigned .*complex128"),
     "text": ("map.png", {}, "an H x W x C array"),
-    "NaN": (changed(random_normals(), (2, 3, 0), (4, 1, 2), value=np.nan), {},
-            "2 NaN or infinite; the first at row 2, column 3"),
-    "infinite": (changed(random_normals(), (0, 6, 1), value=np.inf), {},
-                 "1 NaN or infinite; the first at row 0, column 6"),
-    "zero": (changed(random_normals(), (1, 2), value=0), {},
-             "1 zero; the first at row 1, column 2"),
-    "down": (changed(random_normals(), (3, 0, 2), (3, 1, 2), value=-0.5), {},
-             "2 down-facing; the first at row 3, column 0"),
+    "NaN": (
+        changed(random_normals(), (2, 3, 0), (4, 1, 2), value=np.nan),
+        {},
+        "2 NaN or infinite; the first at row 2, column 3",
+    ),
+    "infinite": (
+        changed(random_normals(), (0, 6, 1), value=np.inf),
+        {},
+        "1 NaN or infinite; the first at row 0, column 6",
+    ),
+    "zero": (
+        changed(random_normals(), (1, 2), value=0),
+        {},
+        "1 zero; the first at row 1, column 2",
+    ),
+    "down": (
+        changed(random_normals(), (3, 0, 2), (3, 1, 2), value=-0.5),
+        {},
+        "2 down-facing; the first at row 3, column 0",
+    ),
     "horizontal": (changed(random_normals(), (3, 0, 2), value=0), {}, "1 down-facing"),
-    "several": (changed(changed(random_normals(), (3, 0), value=0), (0, 1, 1), value=np.nan), {},
-                "1 NaN or infinite, 1 zero; the first at row 0, column 1"),
+    "several": (
+        changed(changed(random_normals(), (3, 0), value=0), (0, 1, 1), value=np.nan),
+        {},
+        "1 NaN or infinite, 1 zero; the first at row 0, column 1",
+    ),
     "black": (np.zeros((2, 2, 3), np.uint8), {"map_type": "normal"}, "4 down-facing"),
-    "outside": (changed(random_normals()[..., :2], (2, 2), value=0.8), {},
-                "x² \\+ y² < 1 (got \"1 outside the disk; the first at row 2, column 2"),
-    "height NaN": (changed(random_heights(), (2, 5), value=np.nan), {},
-                   "finite heights (got \"1 NaN or infinite; the first at row 2, column 5"),
-    "steep": (changed(random_heights(), (2, 3), value=1e30), {}, "a height with slopes below 1000"
-              ".* (got \"4 steeper; the first at row 1, column 3"),
-    "steep by overflow": (changed(random_heights(), (2, 3), (2, 5), value=1.7e308),
-                          {"height_scale": -4.0}, "slopes below 1000"),
-    "height of colours": (random_normals(), {"map_type": "height"},
-                          "a height, .* (got \"3 channels that differ\")"),
-    "height of two": (random_normals()[..., :2], {"map_type": "height"}, "(got \"2 channels\")"),
+    "outside": (
+        changed(random_normals()[..., :2], (2, 2), value=0.8),
+        {},
+        'x² \\+ y² < 1 (got "1 outside the disk; the first at row 2, column 2',
+    ),
+    "height NaN": (
+        changed(random_heights(), (2, 5), value=np.nan),
+        {},
+        'finite heights (got "1 NaN or infinite; the first at row 2, column 5',
+    ),
+    "steep": (
+        changed(random_heights(), (2, 3), value=1e30),
+        {},
+        'a height with slopes below 1000.* (got "4 steeper; the first at row 1, column 3',
+    ),
+    "steep by overflow": (
+        changed(random_heights(), (2, 3), (2, 5), value=1.7e308),
+        {"height_scale": -4.0},
+        "slopes below 1000",
+    ),
+    "height of colours": (
+        random_normals(),
+        {"map_type": "height"},
+        'a height, .* (got "3 channels that differ")',
+    ),
+    "height of two": (random_normals()[..., :2], {"map_type": "height"}, '(got "2 channels")'),
     "normal of one": (random_heights(), {"map_type": "normal"}, "normals, of two or three"),
     "alpha": (np.full((2, 2, 4), 2.0), {}, "fourth channel is an alpha in \\[0, 1\\]"),
 }
@@ -312,19 +365,24 @@ def test_bad_data(case):
         NormalMap.from_array(data, owner="glint_manifold", **options)
 
 
-@pytest.mark.parametrize("option, value, message", [
-    ("map_type", "bump", 'one of auto, normal, height (got "bump")'),
-    ("wrap_mode", "border", 'one of repeat, mirror, clamp (got "border")'),
-    ("height_scale", float("nan"), "a finite number (got nan)"),
-])
+@pytest.mark.parametrize(
+    "option, value, message",
+    [
+        ("map_type", "bump", 'one of auto, normal, height (got "bump")'),
+        ("wrap_mode", "border", 'one of repeat, mirror, clamp (got "border")'),
+        ("height_scale", float("nan"), "a finite number (got nan)"),
+    ],
+)
 def test_bad_options(option, value, message):
     with pytest.raises(ParameterError) as caught:
         NormalMap.from_array(random_heights(), owner="glint_manifold", **{option: value})
     assert str(caught.value) == f'glint_manifold: "{option}" must be {message}'
 
 
-@pytest.mark.parametrize("normals", [np.zeros((3, 3, 3)), np.zeros((3, 2)), np.zeros((0, 3, 2)),
-                                     np.zeros((3, 3, 2), int)])
+@pytest.mark.parametrize(
+    "normals",
+    [np.zeros((3, 3, 3)), np.zeros((3, 2)), np.zeros((0, 3, 2)), np.zeros((3, 3, 2), int)],
+)
 def test_bad_projected_normals(normals):
     with pytest.raises(ParameterError, match='^NormalMap: "normals" must be an H x W x 2 array'):
         NormalMap(normals)
@@ -332,16 +390,18 @@ def test_bad_projected_normals(normals):
 
 def test_bad_bitmap_names_its_parameter():
     with pytest.raises(ParameterError, match='^glint_manifold: "bitmap" must be normals'):
-        NormalMap.from_bitmap(mi.Bitmap(np.zeros((2, 2, 3), np.float32)), "normal",
-                              owner="glint_manifold")
+        NormalMap.from_bitmap(
+            mi.Bitmap(np.zeros((2, 2, 3), np.float32)), "normal", owner="glint_manifold"
+        )
 
 
 def test_missing_file(tmp_path):
     for path in (tmp_path / "none.exr", tmp_path):
         with pytest.raises(ParameterError) as caught:
             NormalMap.load(path, owner="glint_manifold")
-        assert str(caught.value) == ('glint_manifold: "filename" must be the name of an existing '
-                                     f'file (got "{path}")')
+        assert str(caught.value) == (
+            f'glint_manifold: "filename" must be the name of an existing file (got "{path}")'
+        )
 
 
 @pytest.mark.parametrize("suffix", ["exr", "png", "tif", "jpg", "txt", ""])

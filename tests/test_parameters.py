@@ -50,8 +50,10 @@ def test_to_uv(variant):
     for transform in (four, three):
         matrix = np.array(parameters(to_uv=transform).to_uv().matrix)
         assert np.allclose(matrix, [[2, 0, 0.1], [0, 3, 0.2], [0, 0, 1]])
-    for transform in (mi.ScalarTransform4f().scale([1, 0, 1]),
-                      mi.ScalarTransform4f().translate([float("nan"), 0, 0])):
+    for transform in (
+        mi.ScalarTransform4f().scale([1, 0, 1]),
+        mi.ScalarTransform4f().translate([float("nan"), 0, 0]),
+    ):
         with pytest.raises(ParameterError, match='"to_uv" must be a finite, invertible'):
             parameters(to_uv=transform).to_uv()
 
@@ -105,8 +107,9 @@ def test_eta_and_k_of_every_kind(variant):
     assert isinstance(conductor, Conductor)
     assert dr.allclose(conductor.eta.eval(si), [0.2, 1.5, 3.0])
     assert dr.allclose(conductor.k.eval(si), 2)
-    texture = mi.load_dict({"type": "bitmap", "raw": True,
-                            "bitmap": mi.Bitmap(np.full((2, 2, 1), 4, np.float32))})
+    texture = mi.load_dict(
+        {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 1), 4, np.float32))}
+    )
     assert dr.allclose(parameters(eta=texture).fresnel().eta.eval(si), 4)
     assert dr.allclose(parameters(eta=1.0).fresnel().k.eval(si), 1)  # as roughconductor
     assert dr.allclose(parameters(k=1.0).fresnel().eta.eval(si), 0)
@@ -116,12 +119,20 @@ def test_spectra(each_variant):
     si = dr.zeros(mi.SurfaceInteraction3f)
     if mi.is_spectral:
         si.wavelengths = 550
-    given = mi.load_dict({"type": "glint_manifold", "data": mi.TensorXf(np.zeros((2, 2, 2))),
-                          "eta": {"type": "spectrum", "value": [(400, 1.0), (700, 2.0)]}, "k": 0,
-                          "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}})
+    given = mi.load_dict(
+        {
+            "type": "glint_manifold",
+            "data": mi.TensorXf(np.zeros((2, 2, 2))),
+            "eta": {"type": "spectrum", "value": [(400, 1.0), (700, 2.0)]},
+            "k": 0,
+            "specular_reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]},
+        }
+    )
     assert np.allclose(np.array(given.specular_reflectance.eval(si)), 0.5, atol=1e-3)
     if mi.is_spectral:
         assert np.allclose(np.array(given.fresnel.eta.eval(si)), 1.5)
-    assert isinstance(Parameters(mi.Properties("glint_test")).fresnel(),
-                      Conductor if mi.is_polarized else type(None))
+    assert isinstance(
+        Parameters(mi.Properties("glint_test")).fresnel(),
+        Conductor if mi.is_polarized else type(None),
+    )
     assert isinstance(parameters(int_ior=1.5).fresnel(), Dielectric)

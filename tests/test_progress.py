@@ -17,8 +17,10 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.parametrize("stream, seconds, shown", [
-    (Terminal(), 0.5, True), (Terminal(), 0.0, False), (io.StringIO(), 0.5, False)])
+@pytest.mark.parametrize(
+    "stream, seconds, shown",
+    [(Terminal(), 0.5, True), (Terminal(), 0.0, False), (io.StringIO(), 0.5, False)],
+)
 def test_progress(monkeypatch, stream, seconds, shown):
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr(module, "_DELAY", 0.1)

@@ -44,8 +44,13 @@ class FootprintBSDF(mi.BSDF):
     def parameters_changed(self, keys: list[str] = ()) -> None:
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):
             value = getattr(self, key)
-            check(dr.all(dr.isfinite(value) & (value >= 0)),
-                  self.owner, key, "a finite number ≥ 0", value)
+            check(
+                dr.all(dr.isfinite(value) & (value >= 0)),
+                self.owner,
+                key,
+                "a finite number ≥ 0",
+                value,
+            )
 
     def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
         """The footprint at ``si`` in the UV space of the map."""
@@ -58,11 +63,13 @@ class FootprintBSDF(mi.BSDF):
         """Say, once, that nothing tells how large a pixel is."""
         if not self.warned_of_point_footprint:
             self.warned_of_point_footprint = True
-            mi.Log(mi.LogLevel.Warn,
-                   f'{self.owner} "{self.name}": the integrator gives no footprint and '
-                   '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
-                   'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
-                   'set "pixel_spread" to the angle of a pixel in radians.')
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'{self.owner} "{self.name}": the integrator gives no footprint and '
+                '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
+                'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
+                'set "pixel_spread" to the angle of a pixel in radians.',
+            )
 
     def members(self) -> dict[str, object]:
         """What describes this BSDF in print, by name; None is left out."""
@@ -73,8 +80,11 @@ class FootprintBSDF(mi.BSDF):
         }
 
     def to_string(self) -> str:
-        lines = [f"  {name} = {value}".replace("\n", "\n  ")
-                 for name, value in self.members().items() if value is not None]
+        lines = [
+            f"  {name} = {value}".replace("\n", "\n  ")
+            for name, value in self.members().items()
+            if value is not None
+        ]
         return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
 
 
@@ -102,8 +112,12 @@ class GlintBSDF(FootprintBSDF):
         self.fresnel = parameters.fresnel()
         self.specular_reflectance = parameters.specular_reflectance()
 
-        self.m_flags = (mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
-                        | mi.BSDFFlags.SpatiallyVarying | mi.BSDFFlags.Anisotropic)
+        self.m_flags = (
+            mi.BSDFFlags.GlossyReflection
+            | mi.BSDFFlags.FrontSide
+            | mi.BSDFFlags.SpatiallyVarying
+            | mi.BSDFFlags.Anisotropic
+        )
         self.m_components = [self.m_flags]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -112,8 +126,9 @@ class GlintBSDF(FootprintBSDF):
         if self.fresnel is not None:
             self.fresnel.traverse(callback)
         if self.specular_reflectance is not None:
-            callback.put("specular_reflectance", self.specular_reflectance,
-                         mi.ParamFlags.Differentiable)
+            callback.put(
+                "specular_reflectance", self.specular_reflectance, mi.ParamFlags.Differentiable
+            )
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
@@ -121,8 +136,14 @@ class GlintBSDF(FootprintBSDF):
         if self.masking is not None:
             self.masking.parameters_changed()
 
-    def sample(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float,
-               sample2: mi.Point2f, active: mi.Bool = True) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         bs = dr.zeros(mi.BSDFSample3f)
         cos_theta_i = mi.Frame3f.cos_theta(si.wi)
         active = mi.Bool(active) & (cos_theta_i > 0)
@@ -150,16 +171,31 @@ class GlintBSDF(FootprintBSDF):
         weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
         return bs, self.reflected(weight, ctx, si, si.wi, wo, m, footprint, active)
 
-    def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
-             active: mi.Bool = True) -> mi.Spectrum:
+    def eval(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Spectrum:
         return self.eval_pdf(ctx, si, wo, active)[0]
 
-    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
-            active: mi.Bool = True) -> mi.Float:
+    def pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Float:
         return self.eval_pdf(ctx, si, wo, active)[1]
 
-    def eval_pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f,
-                 active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Float]:
+    def eval_pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Spectrum, mi.Float]:
         # One P-NDF query serves both. What a caller does not use, Dr.Jit leaves out of the kernel.
         cos_theta_i = mi.Frame3f.cos_theta(si.wi)
         active = mi.Bool(active) & (cos_theta_i > 0) & (mi.Frame3f.cos_theta(wo) > 0)
@@ -175,11 +211,14 @@ class GlintBSDF(FootprintBSDF):
         density = self.density(si, m, footprint, active)
         value = microfacet.reflected_value(density, wi.z)
         pdf = self.normals().pdf(wi, m, density, footprint, active)
-        return (self.reflected(value, ctx, si, wi, wo, m, footprint, active),
-                dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0))
+        return (
+            self.reflected(value, ctx, si, wi, wo, m, footprint, active),
+            dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0),
+        )
 
-    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f,
-                                 active: mi.Bool = True) -> mi.Spectrum:
+    def eval_diffuse_reflectance(
+        self, si: mi.SurfaceInteraction3f, active: mi.Bool = True
+    ) -> mi.Spectrum:
         """The albedo for denoisers: tint and Fresnel reflectance of the macroscopic surface.
 
         Mitsuba's default, ``π`` times a value of the BRDF, would be the very glints that an albedo
@@ -194,8 +233,9 @@ class GlintBSDF(FootprintBSDF):
         albedo = dr.select(active, albedo, 0)
         return mi.mueller.depolarizer(albedo) if mi.is_polarized else albedo
 
-    def density(self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint,
-                active: mi.Bool) -> mi.Float | mi.UnpolarizedSpectrum:
+    def density(
+        self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float | mi.UnpolarizedSpectrum:
         """D of the unit normal ``m``: one number, or one per channel for a P-NDF with colours."""
         return self.pndf.eval(mi.Vector2f(m.x, m.y), footprint, active)
 
@@ -213,16 +253,25 @@ class GlintBSDF(FootprintBSDF):
         """What tints the surface as seen from afar, where the P-NDF may have colours of its own."""
         return self.tint(si, active)
 
-    def reflected(self, value: mi.Float | mi.UnpolarizedSpectrum, ctx: mi.BSDFContext,
-                  si: mi.SurfaceInteraction3f, wi: mi.Vector3f, wo: mi.Vector3f, m: mi.Vector3f,
-                  footprint: Footprint, active: mi.Bool) -> mi.Spectrum:
+    def reflected(
+        self,
+        value: mi.Float | mi.UnpolarizedSpectrum,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        m: mi.Vector3f,
+        footprint: Footprint,
+        active: mi.Bool,
+    ) -> mi.Spectrum:
         """``value`` times masking, tint and Fresnel reflectance or Mueller matrix, where active."""
         if self.masking is not None:
             value = value * self.masking.eval(wi, wo, footprint, active)
         tint = self.tint(si, active)
         if mi.is_polarized:
             spectrum = microfacet.mueller_reflection(
-                self.fresnel.index(si, active), value * tint, ctx.mode, wi, wo, m)
+                self.fresnel.index(si, active), value * tint, ctx.mode, wi, wo, m
+            )
         else:
             spectrum = value * tint
             if self.fresnel is not None:

@@ -76,8 +76,9 @@ def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
         raise TypeError("only plain arrays can be cached, not arrays of Python objects")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=_PREFIX, suffix=".tmp",
-                                         delete=False) as file:
+        with tempfile.NamedTemporaryFile(
+            dir=path.parent, prefix=_PREFIX, suffix=".tmp", delete=False
+        ) as file:
             try:
                 np.savez(file, **arrays)
                 file.close()
@@ -101,8 +102,11 @@ def _tidy(folder: Path) -> None:
         for entry in folder.glob(f"{_PREFIX}*.tmp"):
             if now - entry.stat().st_mtime > _STALE:
                 entry.unlink()
-        used = sorted(((entry.stat(), entry) for entry in folder.glob(f"{_PREFIX}*.npz")),
-                      key=lambda pair: pair[0].st_mtime, reverse=True)
+        used = sorted(
+            ((entry.stat(), entry) for entry in folder.glob(f"{_PREFIX}*.npz")),
+            key=lambda pair: pair[0].st_mtime,
+            reverse=True,
+        )
         for position, (status, entry) in enumerate(used):
             total += status.st_size
             if total > LIMIT and position > 0:
@@ -111,6 +115,8 @@ def _tidy(folder: Path) -> None:
 
 @functools.cache
 def _warn_once(folder: str, error: str) -> None:
-    warnings.warn(f"glintbsdf builds without its cache, because {folder} cannot be written "
-                  f"({error}). Name another directory in GLINTBSDF_CACHE, or set it to off.",
-                  stacklevel=4)
+    warnings.warn(
+        f"glintbsdf builds without its cache, because {folder} cannot be written "
+        f"({error}). Name another directory in GLINTBSDF_CACHE, or set it to off.",
+        stacklevel=4,
+    )

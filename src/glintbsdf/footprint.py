@@ -118,9 +118,7 @@ def finite_or_zero(v: mi.Vector2f | mi.Vector3f) -> mi.Vector2f | mi.Vector3f:
     return dr.select(dr.all(dr.isfinite(v)), v, type(v)(0))
 
 
-def cone_partials(
-    si: mi.SurfaceInteraction3f, width: mi.Float
-) -> tuple[mi.Vector2f, mi.Vector2f]:
+def cone_partials(si: mi.SurfaceInteraction3f, width: mi.Float) -> tuple[mi.Vector2f, mi.Vector2f]:
     """UV partials of a cone of rays of diameter ``width`` (world units) around ``si.wi``.
 
     Two orthonormal vectors x, y across the viewing direction ω are carried along ω onto the tangent

@@ -35,34 +35,51 @@ def tilted(size: Size, tilt: float = 0.2, azimuth: float = 0.0) -> NormalMap:
     return NormalMap(np.broadcast_to(normal, (*shape, 2)))
 
 
-def isotropic(size: Size, alpha: float = 0.15, correlation_length: float = 6.0,
-              seed: int = 0) -> NormalMap:
+def isotropic(
+    size: Size, alpha: float = 0.15, correlation_length: float = 6.0, seed: int = 0
+) -> NormalMap:
     """A rough surface: Gaussian heights, autocorrelation exp(-(r / correlation_length)²)."""
     shape = _shape("isotropic", size)
     _check_at_least("isotropic", 0, alpha=alpha, correlation_length=correlation_length)
-    height = _gaussian_noise(shape, (correlation_length, correlation_length), 0.0,
-                             np.random.default_rng(seed))
+    height = _gaussian_noise(
+        shape, (correlation_length, correlation_length), 0.0, np.random.default_rng(seed)
+    )
     return NormalMap.from_array(_with_roughness(height, alpha))
 
 
-def brushed(size: Size, alpha: float = 0.2, streak_length: float = 200.0,
-            streak_width: float = 4.0, angle: float = 0.0, seed: int = 0) -> NormalMap:
+def brushed(
+    size: Size,
+    alpha: float = 0.2,
+    streak_length: float = 200.0,
+    streak_width: float = 4.0,
+    angle: float = 0.0,
+    seed: int = 0,
+) -> NormalMap:
     """Brushed metal: Gaussian heights whose streaks run along the direction ``angle``.
 
     ``alpha`` is the roughness across the streaks; along them it is less by the ratio
     ``streak_width / streak_length``, as for any height with these two correlation lengths.
     """
     shape = _shape("brushed", size)
-    _check_at_least("brushed", 0, alpha=alpha, streak_length=streak_length,
-                    streak_width=streak_width)
+    _check_at_least(
+        "brushed", 0, alpha=alpha, streak_length=streak_length, streak_width=streak_width
+    )
     check(bool(np.isfinite(angle)), "maps.brushed", "angle", "a finite number", angle)
-    height = _gaussian_noise(shape, (streak_length, streak_width), angle,
-                             np.random.default_rng(seed))
+    height = _gaussian_noise(
+        shape, (streak_length, streak_width), angle, np.random.default_rng(seed)
+    )
     return NormalMap.from_array(_with_roughness(height, alpha, across=angle + np.pi / 2))
 
 
-def scratched(size: Size, coverage: float = 0.15, length: float = 250.0, width: float = 6.0,
-              slope: float = 0.3, alpha: float = 0.02, seed: int = 0) -> NormalMap:
+def scratched(
+    size: Size,
+    coverage: float = 0.15,
+    length: float = 250.0,
+    width: float = 6.0,
+    slope: float = 0.3,
+    alpha: float = 0.02,
+    seed: int = 0,
+) -> NormalMap:
     """Polished metal with scratches in all directions.
 
     ``coverage`` is the mean number of scratches over a texel: number x length x width over the area
@@ -95,8 +112,13 @@ def flakes(size: Size, alpha: float = 0.2, flake_size: float = 8.0, seed: int = 
     return NormalMap(normals.astype(np.float32)[nearest])
 
 
-def leather(size: Size, alpha: float = 0.25, grain_size: float = 24.0, crease_width: float = 0.25,
-            seed: int = 0) -> NormalMap:
+def leather(
+    size: Size,
+    alpha: float = 0.25,
+    grain_size: float = 24.0,
+    crease_width: float = 0.25,
+    seed: int = 0,
+) -> NormalMap:
     """Leather: rounded grains, about ``grain_size`` texels wide, parted by creases.
 
     ``crease_width`` is a fraction of the grain. ``alpha`` is the roughness of the whole map.
@@ -117,20 +139,30 @@ def leather(size: Size, alpha: float = 0.25, grain_size: float = 24.0, crease_wi
 # Building blocks
 # -------------------------------------------------------------------------------------------------
 
-def _gaussian_noise(shape: tuple[int, int], correlation_lengths: tuple[float, float], angle: float,
-                    rng: np.random.Generator) -> np.ndarray:
+
+def _gaussian_noise(
+    shape: tuple[int, int],
+    correlation_lengths: tuple[float, float],
+    angle: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
     """Periodic Gaussian noise of unit variance, an H x W float32 array.
 
     Its autocorrelation is exp(-(x'/l_0)² - (y'/l_1)²) in axes x', y' turned by ``angle``: white
     noise times the root of that function's Fourier transform.
     """
-    y, x = np.meshgrid(np.fft.fftfreq(shape[0]).astype(np.float32),
-                       np.fft.rfftfreq(shape[1]).astype(np.float32), indexing="ij", sparse=True)
+    y, x = np.meshgrid(
+        np.fft.fftfreq(shape[0]).astype(np.float32),
+        np.fft.rfftfreq(shape[1]).astype(np.float32),
+        indexing="ij",
+        sparse=True,
+    )
     cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    exponent = ((np.float32(correlation_lengths[0]) * (cosine * x + sine * y))**2
-                + (np.float32(correlation_lengths[1]) * (cosine * y - sine * x))**2)
+    exponent = (np.float32(correlation_lengths[0]) * (cosine * x + sine * y)) ** 2 + (
+        np.float32(correlation_lengths[1]) * (cosine * y - sine * x)
+    ) ** 2
     spectrum = np.fft.rfft2(rng.standard_normal(shape, dtype=np.float32))
-    spectrum *= np.exp(np.float32(-np.pi**2 / 2) * exponent)
+    spectrum *= np.exp(np.float32(-(np.pi**2) / 2) * exponent)
     spectrum[0, 0] = 0
     noise = np.fft.irfft2(spectrum, s=shape)
     deviation = noise.std()
@@ -145,12 +177,18 @@ def _with_roughness(height: np.ndarray, alpha: float, across: float | None = Non
         axes = (shape > 2 for shape in height.shape)
         variance = (np.mean(slope_x**2) + np.mean(slope_y**2)) / max(1, sum(axes))
     else:
-        variance = np.mean((np.cos(across) * slope_x + np.sin(across) * slope_y)**2)
+        variance = np.mean((np.cos(across) * slope_x + np.sin(across) * slope_y) ** 2)
     return height * np.float32(alpha / np.sqrt(2 * variance)) if variance > 0 else height
 
 
-def _grooves(shape: tuple[int, int], count: int, length: float, width: float, slope: float,
-             rng: np.random.Generator) -> np.ndarray:
+def _grooves(
+    shape: tuple[int, int],
+    count: int,
+    length: float,
+    width: float,
+    slope: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
     """Heights, zero or negative, of ``count`` random scratches; see :func:`scratched`.
 
     A scratch is followed along its major axis, x or y, whichever is nearer to its direction: at
@@ -169,11 +207,12 @@ def _grooves(shape: tuple[int, int], count: int, length: float, width: float, sl
     arc = along * np.sqrt(1 + tangent**2)
     centre = middle[1] + along * tangent + arc**2 * curvature / 2
     minor = np.floor(centre) + beside
-    distance = (minor + 0.5 - centre) / np.sqrt(1 + (tangent + arc * curvature)**2)
+    distance = (minor + 0.5 - centre) / np.sqrt(1 + (tangent + arc * curvature) ** 2)
     # (1 - x²)² is steepest at x = 1/√3, where its slope is 8/(3√3).
     depth = rng.uniform(0.5, 1, (count, 1, 1)) * slope * half_width * 3 * np.sqrt(3) / 8
-    groove = (np.maximum(0, 1 - (distance / half_width)**2)**2
-              * np.maximum(0, 1 - (arc / half_length)**2))
+    groove = np.maximum(0, 1 - (distance / half_width) ** 2) ** 2 * np.maximum(
+        0, 1 - (arc / half_length) ** 2
+    )
     major = np.floor(middle[0]) + along
     row = np.where(major_is_y, major, minor).astype(int) % shape[0]
     column = np.where(major_is_y, minor, major).astype(int) % shape[1]
@@ -182,8 +221,9 @@ def _grooves(shape: tuple[int, int], count: int, length: float, width: float, sl
     return height
 
 
-def _voronoi(shape: tuple[int, int], cell_size: float, rng: np.random.Generator
-             ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+def _voronoi(
+    shape: tuple[int, int], cell_size: float, rng: np.random.Generator
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
     """Periodic Voronoi cells of a jittered grid of points.
 
     Returns the number of points, and for each texel the index of the nearest point, its distance
@@ -203,8 +243,9 @@ def _voronoi(shape: tuple[int, int], cell_size: float, rng: np.random.Generator
         for column_offset in (-1, 0, 1):
             i, j = row + row_offset, column + column_offset
             point = jitter[i % grid[0], j % grid[1]]
-            distance = np.hypot((i + point[..., 0]) * cell[0] - y,
-                                (j + point[..., 1]) * cell[1] - x)
+            distance = np.hypot(
+                (i + point[..., 0]) * cell[0] - y, (j + point[..., 1]) * cell[1] - x
+            )
             closer = distance < first
             second = np.where(closer, first, np.minimum(second, distance))
             first = np.minimum(first, distance)
@@ -216,6 +257,7 @@ def _voronoi(shape: tuple[int, int], cell_size: float, rng: np.random.Generator
 # Checks
 # -------------------------------------------------------------------------------------------------
 
+
 def _shape(name: str, size: Size) -> tuple[int, int]:
     pair = size if isinstance(size, tuple | list) else (size, size)
     valid = len(pair) == 2 and all(isinstance(n, int | np.integer) and n >= 1 for n in pair)
@@ -225,5 +267,10 @@ def _shape(name: str, size: Size) -> tuple[int, int]:
 
 def _check_at_least(name: str, minimum: float, **parameters: float) -> None:
     for parameter, value in parameters.items():
-        check(bool(np.isfinite(value) and value >= minimum), f"maps.{name}", parameter,
-              f"a finite number of at least {minimum}", value)
+        check(
+            bool(np.isfinite(value) and value >= minimum),
+            f"maps.{name}",
+            parameter,
+            f"a finite number of at least {minimum}",
+            value,
+        )

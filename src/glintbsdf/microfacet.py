@@ -63,13 +63,25 @@ class PndfNormals:
     def __init__(self, pndf: object) -> None:
         self.pndf = pndf
 
-    def sample(self, wi: mi.Vector3f, footprint: Footprint, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool) -> mi.Vector3f:
+    def sample(
+        self,
+        wi: mi.Vector3f,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool,
+    ) -> mi.Vector3f:
         """A unit normal for the view from ``wi``; one with z ≤ 0 is an invalid sample."""
         return normal_from_projection(self.pndf.sample(footprint, sample1, sample2, active))
 
-    def pdf(self, wi: mi.Vector3f, m: mi.Vector3f, density: mi.Float, footprint: Footprint,
-            active: mi.Bool) -> mi.Float:
+    def pdf(
+        self,
+        wi: mi.Vector3f,
+        m: mi.Vector3f,
+        density: mi.Float,
+        footprint: Footprint,
+        active: mi.Bool,
+    ) -> mi.Float:
         """Density of ``m`` per solid angle, given ``density``, which is D(m)."""
         return density * m.z
 
@@ -86,13 +98,25 @@ class VisibleBeckmannNormals:
             mi.MicrofacetType.Beckmann, alpha.x, alpha.y, sample_visible=True
         )
 
-    def sample(self, wi: mi.Vector3f, footprint: Footprint, sample1: mi.Float, sample2: mi.Point2f,
-               active: mi.Bool) -> mi.Vector3f:
+    def sample(
+        self,
+        wi: mi.Vector3f,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool,
+    ) -> mi.Vector3f:
         """As :meth:`PndfNormals.sample`."""
         return mi.Vector3f(self.distribution.sample(wi, sample2)[0])
 
-    def pdf(self, wi: mi.Vector3f, m: mi.Vector3f, density: mi.Float, footprint: Footprint,
-            active: mi.Bool) -> mi.Float:
+    def pdf(
+        self,
+        wi: mi.Vector3f,
+        m: mi.Vector3f,
+        density: mi.Float,
+        footprint: Footprint,
+        active: mi.Bool,
+    ) -> mi.Float:
         """As :meth:`PndfNormals.pdf`; ``density`` plays no part."""
         return self.distribution.pdf(wi, m)
 
@@ -115,14 +139,18 @@ class Conductor:
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         """The complex index of refraction at ``si``, one entry per channel of a spectrum."""
-        return [mi.Complex2f(eta, k) for eta, k in
-                zip(self.eta.eval(si, active), self.k.eval(si, active), strict=True)]
+        return [
+            mi.Complex2f(eta, k)
+            for eta, k in zip(self.eta.eval(si, active), self.k.eval(si, active), strict=True)
+        ]
 
-    def reflectance(self, cos_theta: mi.Float, si: mi.SurfaceInteraction3f,
-                    active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    def reflectance(
+        self, cos_theta: mi.Float, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> mi.UnpolarizedSpectrum:
         """Unpolarised reflectance at the angle of incidence ``cos_theta`` (> 0)."""
-        return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_theta, index)
-                                       for index in self.index(si, active)])
+        return mi.UnpolarizedSpectrum(
+            [mi.fresnel_conductor(cos_theta, index) for index in self.index(si, active)]
+        )
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -147,8 +175,9 @@ class Dielectric:
         """As :meth:`Conductor.index`; the same for every channel."""
         return [mi.Complex2f(self.eta, 0)] * dr.size_v(mi.UnpolarizedSpectrum)
 
-    def reflectance(self, cos_theta: mi.Float, si: mi.SurfaceInteraction3f,
-                    active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    def reflectance(
+        self, cos_theta: mi.Float, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> mi.UnpolarizedSpectrum:
         """As :meth:`Conductor.reflectance`."""
         return mi.UnpolarizedSpectrum(mi.fresnel(cos_theta, self.eta)[0])
 
@@ -159,9 +188,14 @@ class Dielectric:
         return f"Dielectric[eta = {self.eta[0]:g}]"
 
 
-def mueller_reflection(index: list[mi.Complex2f], tint: mi.UnpolarizedSpectrum,
-                       mode: mi.TransportMode, wi: mi.Vector3f, wo: mi.Vector3f,
-                       m: mi.Vector3f) -> mi.Spectrum:
+def mueller_reflection(
+    index: list[mi.Complex2f],
+    tint: mi.UnpolarizedSpectrum,
+    mode: mi.TransportMode,
+    wi: mi.Vector3f,
+    wo: mi.Vector3f,
+    m: mi.Vector3f,
+) -> mi.Spectrum:
     """Mueller matrix (4×4 of spectra) of the reflection from a facet with normal ``m``.
 
     It acts on Stokes vectors in Mitsuba's implicit bases of the light's directions of propagation:
@@ -172,10 +206,17 @@ def mueller_reflection(index: list[mi.Complex2f], tint: mi.UnpolarizedSpectrum,
         wi, wo = wo, wi
     cos_theta = dr.dot(wo, m)
     channels = [mi.mueller.specular_reflection(cos_theta, n) for n in index]
-    reflection = mi.Spectrum([
-        [mi.UnpolarizedSpectrum([t * channel[row][column]
-                                 for t, channel in zip(tint, channels, strict=True)])
-         for column in range(4)] for row in range(4)])
+    reflection = mi.Spectrum(
+        [
+            [
+                mi.UnpolarizedSpectrum(
+                    [t * channel[row][column] for t, channel in zip(tint, channels, strict=True)]
+                )
+                for column in range(4)
+            ]
+            for row in range(4)
+        ]
+    )
 
     # The matrix refers to the s axes, normal to the plane of incidence; at normal incidence, where
     # there is no such plane, any axis will do.
@@ -183,9 +224,9 @@ def mueller_reflection(index: list[mi.Complex2f], tint: mi.UnpolarizedSpectrum,
     collinear = dr.squared_norm(s_in) == 0
     s_in = dr.select(collinear, mi.Vector3f(1, 0, 0), dr.normalize(s_in))
     s_out = dr.select(collinear, mi.Vector3f(1, 0, 0), dr.normalize(s_out))
-    return mi.mueller.rotate_mueller_basis(reflection,
-                                           -wo, s_in, mi.mueller.stokes_basis(-wo),
-                                           wi, s_out, mi.mueller.stokes_basis(wi))
+    return mi.mueller.rotate_mueller_basis(
+        reflection, -wo, s_in, mi.mueller.stokes_basis(-wo), wi, s_out, mi.mueller.stokes_basis(wi)
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -209,8 +250,9 @@ class SmithMasking:
         """Λ(w) ≥ 0 of the facets under the footprint, such that ``G1(w) = 1 / (1 + Λ(w))``."""
         raise NotImplementedError
 
-    def eval(self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint,
-             active: mi.Bool) -> mi.Float:
+    def eval(
+        self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float:
         """The factor G in [0, 1] for two directions of the upper hemisphere."""
         lambda_i = self.smith_lambda(wi, footprint, active)
         lambda_o = self.smith_lambda(wo, footprint, active)
@@ -239,8 +281,10 @@ class BeckmannMasking(SmithMasking):
 
     def __repr__(self) -> str:
         alpha_u, alpha_v = (sqrt(x[0]) for x in self.alpha_squared)
-        return (f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
-                f"height_correlated = {self.height_correlated}]")
+        return (
+            f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
+            f"height_correlated = {self.height_correlated}]"
+        )
 
 
 class MapBeckmannMasking(BeckmannMasking):

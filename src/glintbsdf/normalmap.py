@@ -53,31 +53,51 @@ class NormalMap:
     raised for a wrong shape, for NaN or infinite values and for normals on or outside the disk.
     """
 
-    def __init__(self, normals: npt.ArrayLike, wrap_mode: str = "repeat",
-                 owner: str = "NormalMap", parameter: str = "normals") -> None:
+    def __init__(
+        self,
+        normals: npt.ArrayLike,
+        wrap_mode: str = "repeat",
+        owner: str = "NormalMap",
+        parameter: str = "normals",
+    ) -> None:
         check_choice(owner, "wrap_mode", wrap_mode, WRAP_MODES)
         normals = np.asarray(normals)
-        check(normals.ndim == 3 and normals.shape[2] == 2 and normals.size > 0 and
-              np.issubdtype(normals.dtype, np.floating),
-              owner, parameter, "an H x W x 2 array of floating-point numbers with H, W >= 1",
-              _shape_and_type(normals))
+        check(
+            normals.ndim == 3
+            and normals.shape[2] == 2
+            and normals.size > 0
+            and np.issubdtype(normals.dtype, np.floating),
+            owner,
+            parameter,
+            "an H x W x 2 array of floating-point numbers with H, W >= 1",
+            _shape_and_type(normals),
+        )
 
         with np.errstate(over="ignore"):  # too large for float32 is infinite, and refused below
             normals = np.array(normals, dtype=np.float32, order="C")
             squared_length = np.einsum("ijk,ijk->ij", normals, normals, dtype=np.float64)
         finite = np.isfinite(normals).all(axis=2)
-        check_texels(owner, parameter, "normals inside the unit disk, x² + y² < 1", {
-            "NaN or infinite": ~finite,
-            "outside the disk": finite & ~(squared_length < 1)})
+        check_texels(
+            owner,
+            parameter,
+            "normals inside the unit disk, x² + y² < 1",
+            {"NaN or infinite": ~finite, "outside the disk": finite & ~(squared_length < 1)},
+        )
 
         normals.flags.writeable = False
         self.normals: npt.NDArray[np.float32] = normals
         self.wrap_mode = wrap_mode
 
     @classmethod
-    def from_array(cls, data: Any, map_type: str = "auto", height_scale: float = 1.0,
-                   wrap_mode: str = "repeat", owner: str = "NormalMap",
-                   parameter: str = "data") -> NormalMap:
+    def from_array(
+        cls,
+        data: Any,
+        map_type: str = "auto",
+        height_scale: float = 1.0,
+        wrap_mode: str = "repeat",
+        owner: str = "NormalMap",
+        parameter: str = "data",
+    ) -> NormalMap:
         """Make a map from an array or tensor of H x W or H x W x C values, C = 1…4.
 
         * C = 1 is a height;
@@ -90,14 +110,21 @@ class NormalMap:
         Anything NumPy can read is accepted, among it ``mi.TensorXf`` and whatever speaks DLPack.
         Raises :class:`~glintbsdf.errors.ParameterError`.
         """
-        normals = _projected_normals(_as_array(data, owner, parameter), map_type, height_scale,
-                                     wrap_mode, owner, parameter)
+        normals = _projected_normals(
+            _as_array(data, owner, parameter), map_type, height_scale, wrap_mode, owner, parameter
+        )
         return cls(normals, wrap_mode, owner, parameter)
 
     @classmethod
-    def from_bitmap(cls, bitmap: mi.Bitmap, map_type: str = "auto", height_scale: float = 1.0,
-                    wrap_mode: str = "repeat", owner: str = "NormalMap",
-                    parameter: str = "bitmap") -> NormalMap:
+    def from_bitmap(
+        cls,
+        bitmap: mi.Bitmap,
+        map_type: str = "auto",
+        height_scale: float = 1.0,
+        wrap_mode: str = "repeat",
+        owner: str = "NormalMap",
+        parameter: str = "bitmap",
+    ) -> NormalMap:
         """Make a map from an ``mi.Bitmap``, whose gamma flag is ignored.
 
         Channels are as in :meth:`from_array`. Mitsuba calls any two channels luminance and alpha:
@@ -109,8 +136,14 @@ class NormalMap:
         return cls.from_array(data, map_type, height_scale, wrap_mode, owner, parameter)
 
     @classmethod
-    def load(cls, filename: str | Path, map_type: str = "auto", height_scale: float = 1.0,
-             wrap_mode: str = "repeat", owner: str = "NormalMap") -> NormalMap:
+    def load(
+        cls,
+        filename: str | Path,
+        map_type: str = "auto",
+        height_scale: float = 1.0,
+        wrap_mode: str = "repeat",
+        owner: str = "NormalMap",
+    ) -> NormalMap:
         """Read a map from an image file.
 
         OpenEXR (half, float, unsigned integer; channels R,G,B or X,Y,Z or R,G or X,Y or Y, in a
@@ -126,8 +159,9 @@ class NormalMap:
         try:
             data = reader(path)
         except Exception as error:  # each library has its own exceptions; all of them mean this:
-            raise ParameterError(f'{owner}: "filename" must be a readable image file '
-                                 f'(got "{filename}": {error})') from error
+            raise ParameterError(
+                f'{owner}: "filename" must be a readable image file (got "{filename}": {error})'
+            ) from error
         return cls.from_array(data, map_type, height_scale, wrap_mode, owner, "filename")
 
     @property
@@ -155,8 +189,10 @@ class NormalMap:
         """
         x, y = self.normals.astype(np.float64).transpose(2, 0, 1)
         z_squared = 1 - x**2 - y**2
-        return (float(np.sqrt(2 * np.mean(x**2 / z_squared))),
-                float(np.sqrt(2 * np.mean(y**2 / z_squared))))
+        return (
+            float(np.sqrt(2 * np.mean(x**2 / z_squared))),
+            float(np.sqrt(2 * np.mean(y**2 / z_squared))),
+        )
 
     def __repr__(self) -> str:
         return f"NormalMap({self.height} x {self.width}, wrap_mode={self.wrap_mode!r})"
@@ -166,6 +202,7 @@ class NormalMap:
 # From channels to projected normals
 # -------------------------------------------------------------------------------------------------
 
+
 def _as_array(data: Any, owner: str, parameter: str) -> np.ndarray:
     """Read anything array-like as H x W x C; checks shape and type."""
     if hasattr(data, "__dlpack__") and not hasattr(data, "__array__"):
@@ -173,15 +210,26 @@ def _as_array(data: Any, owner: str, parameter: str) -> np.ndarray:
     array = np.asarray(data)
     if array.ndim == 2:
         array = array[..., None]
-    check(array.ndim == 3 and array.size > 0 and array.shape[2] <= 4, owner, parameter, _SHAPE,
-          _shape_and_type(np.asarray(data)))
-    check(np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.unsignedinteger),
-          owner, parameter, "floating-point numbers or unsigned integers", str(array.dtype))
+    check(
+        array.ndim == 3 and array.size > 0 and array.shape[2] <= 4,
+        owner,
+        parameter,
+        _SHAPE,
+        _shape_and_type(np.asarray(data)),
+    )
+    check(
+        np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.unsignedinteger),
+        owner,
+        parameter,
+        "floating-point numbers or unsigned integers",
+        str(array.dtype),
+    )
     return array
 
 
-def _projected_normals(data: np.ndarray, map_type: str, height_scale: float, wrap_mode: str,
-                       owner: str, parameter: str) -> np.ndarray:
+def _projected_normals(
+    data: np.ndarray, map_type: str, height_scale: float, wrap_mode: str, owner: str, parameter: str
+) -> np.ndarray:
     """Turn H x W x C values into H x W x 2 projected normals; see :meth:`NormalMap.from_array`."""
     check_choice(owner, "map_type", map_type, MAP_TYPES)
     check_choice(owner, "wrap_mode", wrap_mode, WRAP_MODES)
@@ -189,18 +237,28 @@ def _projected_normals(data: np.ndarray, map_type: str, height_scale: float, wra
 
     if data.shape[2] == 4:
         alpha = _as_fractions(data[..., 3])
-        check(bool(np.all((alpha >= 0) & (alpha <= 1))), owner, parameter,
-              "a map whose fourth channel is an alpha in [0, 1]",
-              f"a fourth channel from {alpha.min():.6g} to {alpha.max():.6g}")
+        check(
+            bool(np.all((alpha >= 0) & (alpha <= 1))),
+            owner,
+            parameter,
+            "a map whose fourth channel is an alpha in [0, 1]",
+            f"a fourth channel from {alpha.min():.6g} to {alpha.max():.6g}",
+        )
         data = data[..., :3]
 
     channels = data.shape[2]
     is_grey = channels == 1 or (channels == 3 and bool(np.all(data == data[..., :1])))
     if map_type == "height" or (map_type == "auto" and is_grey):
-        check(is_grey, owner, parameter, "a height, one channel or three equal ones",
-              f"{channels} channels that differ" if channels == 3 else f"{channels} channels")
-        return _normals_from_height(_as_fractions(data[..., 0]), height_scale, wrap_mode,
-                                    owner, parameter)
+        check(
+            is_grey,
+            owner,
+            parameter,
+            "a height, one channel or three equal ones",
+            f"{channels} channels that differ" if channels == 3 else f"{channels} channels",
+        )
+        return _normals_from_height(
+            _as_fractions(data[..., 0]), height_scale, wrap_mode, owner, parameter
+        )
 
     check(channels > 1, owner, parameter, "normals, of two or three channels", "1 channel")
     vectors = _as_fractions(data)
@@ -217,8 +275,9 @@ def _as_fractions(data: np.ndarray) -> np.ndarray:
     return data.astype(np.result_type(data.dtype, np.float32), copy=False)
 
 
-def _normals_from_height(height: np.ndarray, height_scale: float, wrap_mode: str,
-                         owner: str, parameter: str) -> np.ndarray:
+def _normals_from_height(
+    height: np.ndarray, height_scale: float, wrap_mode: str, owner: str, parameter: str
+) -> np.ndarray:
     """``n ∝ (-∂h/∂x, -∂h/∂y, 1)`` by central differences, in texels."""
     check_texels(owner, parameter, "finite heights", {"NaN or infinite": ~np.isfinite(height)})
     # Mirrored about the border, the texel beyond it is the border texel itself, as when clamped.
@@ -229,8 +288,12 @@ def _normals_from_height(height: np.ndarray, height_scale: float, wrap_mode: str
         slope_y = scale * (padded[2:, 1:-1] - padded[:-2, 1:-1])
         length = np.hypot(np.hypot(slope_x, slope_y), 1)
     # Steeper ones would be horizontal in float32.
-    check_texels(owner, parameter, f"a height with slopes below {MAX_SLOPE}, after height_scale",
-                  {"steeper": ~(length < MAX_SLOPE)})
+    check_texels(
+        owner,
+        parameter,
+        f"a height with slopes below {MAX_SLOPE}, after height_scale",
+        {"steeper": ~(length < MAX_SLOPE)},
+    )
     return np.stack((-slope_x / length, -slope_y / length), axis=2)
 
 
@@ -238,10 +301,16 @@ def _project(vectors: np.ndarray, owner: str, parameter: str) -> np.ndarray:
     """Normalise vectors (x, y, z), which rounding to 8 bits leaves off the sphere, and drop z."""
     finite = np.isfinite(vectors).all(axis=2)
     zero = ~vectors.any(axis=2)
-    check_texels(owner, parameter, "normals that are finite, non-zero and face up, z > 0", {
-        "NaN or infinite": ~finite,
-        "zero": zero,
-        "down-facing": finite & ~zero & ~(vectors[..., 2] > 0)})
+    check_texels(
+        owner,
+        parameter,
+        "normals that are finite, non-zero and face up, z > 0",
+        {
+            "NaN or infinite": ~finite,
+            "zero": zero,
+            "down-facing": finite & ~zero & ~(vectors[..., 2] > 0),
+        },
+    )
     length = np.sqrt(np.einsum("ijk,ijk->ij", vectors, vectors, dtype=np.float64))
     return vectors[..., :2] / length[..., None]
 
@@ -250,15 +319,22 @@ def _project(vectors: np.ndarray, owner: str, parameter: str) -> np.ndarray:
 # Telling what is wrong
 # -------------------------------------------------------------------------------------------------
 
-def check_texels(owner: str, parameter: str, requirement: str,
-                  faults: Mapping[str, np.ndarray]) -> None:
+
+def check_texels(
+    owner: str, parameter: str, requirement: str, faults: Mapping[str, np.ndarray]
+) -> None:
     """Raise unless every H x W mask of ``faults`` is empty; tell each count and the first place."""
     counts = {fault: int(np.count_nonzero(mask)) for fault, mask in faults.items()}
     if any(counts.values()):
         row, column = np.argwhere(np.logical_or.reduce(list(faults.values())))[0]
         listed = ", ".join(f"{count} {fault}" for fault, count in counts.items() if count)
-        check(False, owner, parameter, requirement,
-              f"{listed}; the first at row {row}, column {column}")
+        check(
+            False,
+            owner,
+            parameter,
+            requirement,
+            f"{listed}; the first at row {row}, column {column}",
+        )
 
 
 def _shape_and_type(array: np.ndarray) -> str:
@@ -268,6 +344,7 @@ def _shape_and_type(array: np.ndarray) -> str:
 # -------------------------------------------------------------------------------------------------
 # Reading files
 # -------------------------------------------------------------------------------------------------
+
 
 def _read_exr(path: Path) -> np.ndarray:
     """Read with OpenEXR: Mitsuba's own reader never returns on a machine with one CPU."""

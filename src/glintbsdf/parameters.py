@@ -41,8 +41,9 @@ class Parameters:
         value = self.props.get(name, default)
         requirement = "a finite number" + (f" ≥ {minimum:g}" if isfinite(minimum) else "")
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        check(is_number and isfinite(value) and value >= minimum,
-              self.owner, name, requirement, value)
+        check(
+            is_number and isfinite(value) and value >= minimum, self.owner, name, requirement, value
+        )
         return float(value)
 
     def per_axis(self, name: str, default: float) -> tuple[float, float]:
@@ -70,8 +71,9 @@ class Parameters:
         given = [name for group in groups for name in group if name in self.props]
         if sum(any(name in self.props for name in group) for group in groups) > 1:
             choices = " or ".join(" and ".join(f'"{name}"' for name in group) for group in groups)
-            raise ParameterError(f"{self.owner}: {choices} exclude each other "
-                                 f"(got {', '.join(given)})")
+            raise ParameterError(
+                f"{self.owner}: {choices} exclude each other (got {', '.join(given)})"
+            )
 
     # ----------------------------------------------------------------------------------------------
     #  The normal map
@@ -83,8 +85,10 @@ class Parameters:
         self.only_one_of(*((source,) for source in MAP_SOURCES))
         sources = [source for source in MAP_SOURCES if source in self.props]
         if not sources:
-            raise ParameterError(f'{self.owner}: one of "filename", "bitmap" or "data" must give '
-                                 "the normal or height map (got none of them)")
+            raise ParameterError(
+                f'{self.owner}: one of "filename", "bitmap" or "data" must give '
+                "the normal or height map (got none of them)"
+            )
         source = sources[0]
         value = self.props[source]
         options = {
@@ -99,21 +103,38 @@ class Parameters:
         if source == "bitmap":
             check(isinstance(value, mi.Bitmap), self.owner, source, "an mi.Bitmap", value)
             return NormalMap.from_bitmap(value, **options)
-        check(self.props.type(source) == mi.Properties.Type.Any and hasattr(value, "shape"),
-              self.owner, source, "a tensor such as mi.TensorXf, of H×W×C values", value)
+        check(
+            self.props.type(source) == mi.Properties.Type.Any and hasattr(value, "shape"),
+            self.owner,
+            source,
+            "a tensor such as mi.TensorXf, of H×W×C values",
+            value,
+        )
         return NormalMap.from_array(value, **options)
 
     def to_uv(self) -> mi.ScalarAffineTransform3f:
         """The transform of UV space, whose linear part must be finite and invertible."""
         value = self.props.get("to_uv", mi.ScalarAffineTransform4f())
-        check(self.props.type("to_uv") == mi.Properties.Type.Transform if "to_uv" in self.props
-              else True, self.owner, "to_uv", "a transform", value)
+        check(
+            self.props.type("to_uv") == mi.Properties.Type.Transform
+            if "to_uv" in self.props
+            else True,
+            self.owner,
+            "to_uv",
+            "a transform",
+            value,
+        )
         to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)
         matrix = to_uv.matrix
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         entries = [matrix[row, column] for row in range(2) for column in range(3)]
-        check(all(map(isfinite, entries)) and determinant != 0,
-              self.owner, "to_uv", "a finite, invertible transform of the UV plane", entries)
+        check(
+            all(map(isfinite, entries)) and determinant != 0,
+            self.owner,
+            "to_uv",
+            "a finite, invertible transform of the UV plane",
+            entries,
+        )
         return to_uv
 
     # ----------------------------------------------------------------------------------------------
@@ -138,14 +159,20 @@ class Parameters:
             try:
                 bitmap = mi.Bitmap(str(path))
             except RuntimeError as error:
-                raise ParameterError(f'{self.owner}: "{name}" must be a readable image file '
-                                     f'(got "{value}": {error})') from error
+                raise ParameterError(
+                    f'{self.owner}: "{name}" must be a readable image file (got "{value}": {error})'
+                ) from error
         check(isinstance(bitmap, mi.Bitmap), self.owner, name, requirement, value)
         pixels = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
         pixels = pixels.reshape(-1, 3)
         bad = ~(np.isfinite(pixels) & (pixels >= 0)).all(axis=1)
-        check(len(pixels) > 0 and not bad.any(), self.owner, name,
-              "an image of finite colours ≥ 0", f"{bad.sum()} other pixels of {len(pixels)}")
+        check(
+            len(pixels) > 0 and not bad.any(),
+            self.owner,
+            name,
+            "an image of finite colours ≥ 0",
+            f"{bad.sum()} other pixels of {len(pixels)}",
+        )
         return pixels
 
     # ----------------------------------------------------------------------------------------------
@@ -184,17 +211,27 @@ class Parameters:
         Only what is given as numbers is checked here: a texture has checked itself.
         """
         value = self.props.get(name, default)
-        numeric = {mi.Properties.Type.Integer: lambda: [value],
-                   mi.Properties.Type.Float: lambda: [value],
-                   mi.Properties.Type.Color: lambda: list(value),
-                   mi.Properties.Type.Spectrum: lambda: list(value.values)}
+        numeric = {
+            mi.Properties.Type.Integer: lambda: [value],
+            mi.Properties.Type.Float: lambda: [value],
+            mi.Properties.Type.Color: lambda: list(value),
+            mi.Properties.Type.Spectrum: lambda: list(value.values),
+        }
         kind = self.props.type(name) if name in self.props else mi.Properties.Type.Float
         is_texture = isinstance(value, mi.Texture)
-        requirement = ("a number, colour, spectrum or texture of finite values ≥ 0"
-                       + (f" and ≤ {maximum:g}" if isfinite(maximum) else ""))
-        check(is_texture or (kind in numeric and
-                             all(isfinite(x) and 0 <= x <= maximum for x in numeric[kind]())),
-              self.owner, name, requirement, value)
+        requirement = "a number, colour, spectrum or texture of finite values ≥ 0" + (
+            f" and ≤ {maximum:g}" if isfinite(maximum) else ""
+        )
+        check(
+            is_texture
+            or (
+                kind in numeric and all(isfinite(x) and 0 <= x <= maximum for x in numeric[kind]())
+            ),
+            self.owner,
+            name,
+            requirement,
+            value,
+        )
         # Mitsuba bounds the colours of get_texture by 1: fit for a reflectance, not for an index.
         if isfinite(maximum):
             return self.props.get_texture(name, default)
@@ -210,8 +247,10 @@ class Parameters:
                 return mi.lookup_ior(named, name, default)
             except RuntimeError as error:
                 choices = str(error).partition("Valid choices are:")[2].strip()
-                raise ParameterError(f'{self.owner}: "{name}" must be a number > 0 or one of '
-                                     f'{choices} (got "{value}")') from None
+                raise ParameterError(
+                    f'{self.owner}: "{name}" must be a number > 0 or one of '
+                    f'{choices} (got "{value}")'
+                ) from None
         number = self.number(name, 0.0)
         check(number > 0, self.owner, name, "a number > 0 or the name of a material", value)
         return number
@@ -228,8 +267,10 @@ class Parameters:
         try:
             mi.load_dict({"type": "conductor", "material": material}).traverse(Collect())
         except RuntimeError:
-            presets = sorted(path.name.removesuffix(".eta.spd") for path in
-                             Path(mi.__file__).parent.glob("data/ior/*.eta.spd"))
+            presets = sorted(
+                path.name.removesuffix(".eta.spd")
+                for path in Path(mi.__file__).parent.glob("data/ior/*.eta.spd")
+            )
             check_choice(self.owner, "material", material, ("none", *presets))
             raise
         return found["eta"], found["k"]

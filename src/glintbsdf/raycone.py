@@ -107,12 +107,11 @@ class RayCone:
         def turned(dp, dd):
             du, dv = tangent_to_uv(si.dp_du, si.dp_dv, dp)
             dd_straight = dd * inv_eta + (si.dn_du * du + si.dn_dv * dv) * (side * mu)
-            return _across(
-                d_out, dd_straight - h * (dr.dot(d_out, dd_straight) / dr.dot(d_out, h))
-            )
+            return _across(d_out, dd_straight - h * (dr.dot(d_out, dd_straight) / dr.dot(d_out, h)))
 
-        cone = RayCone(self.dp_x, self.dp_y, turned(self.dp_x, self.dd_x),
-                       turned(self.dp_y, self.dd_y))
+        cone = RayCone(
+            self.dp_x, self.dp_y, turned(self.dp_x, self.dd_x), turned(self.dp_y, self.dd_y)
+        )
         return cone.widened(d_out, spread)
 
     def widened(self, d: mi.Vector3f, spread: mi.Float) -> RayCone:
@@ -126,9 +125,7 @@ class RayCone:
         return RayCone(self.dp_x, self.dp_y, self.dd_x + x * spread, self.dd_y + y * spread)
 
 
-def curved_interaction(
-    pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f
-) -> mi.SurfaceInteraction3f:
+def curved_interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
     """The surface interaction of ``pi`` with all fields, the derivatives of its shading normal
     ``dn_du`` and ``dn_dv`` included.
 

@@ -77,10 +77,19 @@ class BinnedPNDF:
         return float(np.sqrt(2 / np.pi) * noise)
 
 
-def binned_pndf(normal_map: NormalMap, uv: npt.ArrayLike, covariance: npt.ArrayLike, *,
-                kernel: str = "gaussian", epsilon: float = 1e-6, sigma_r: float = 0.0,
-                res: int = 128, bounds: Bounds | None = None, samples: int = 10_000_000,
-                seed: int = 0) -> BinnedPNDF:
+def binned_pndf(
+    normal_map: NormalMap,
+    uv: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    *,
+    kernel: str = "gaussian",
+    epsilon: float = 1e-6,
+    sigma_r: float = 0.0,
+    res: int = 128,
+    bounds: Bounds | None = None,
+    samples: int = 10_000_000,
+    seed: int = 0,
+) -> BinnedPNDF:
     """Estimate the P-NDF of a map under a footprint on a grid of ``res`` x ``res`` bins.
 
     ``uv`` is the footprint's centre. ``covariance`` is its covariance in UV², a symmetric positive
@@ -100,13 +109,23 @@ def binned_pndf(normal_map: NormalMap, uv: npt.ArrayLike, covariance: npt.ArrayL
     check(res >= 1, owner, "res", "at least 1", res)
     check(samples >= 1, owner, "samples", "at least 1", samples)
     centre = np.asarray(uv, np.float64)
-    check(centre.shape == (2,) and bool(np.isfinite(centre).all()), owner, "uv",
-          "two finite numbers", uv)
+    check(
+        centre.shape == (2,) and bool(np.isfinite(centre).all()),
+        owner,
+        "uv",
+        "two finite numbers",
+        uv,
+    )
     if bounds is None:
         bounds = normal_bounds(normal_map, epsilon, sigma_r)
     corners = np.asarray(bounds, np.float64)
-    check(corners.shape == (2, 2) and bool((corners[0] < corners[1]).all()), owner, "bounds",
-          "((x_min, y_min), (x_max, y_max))", bounds)
+    check(
+        corners.shape == (2, 2) and bool((corners[0] < corners[1]).all()),
+        owner,
+        "bounds",
+        "((x_min, y_min), (x_max, y_max))",
+        bounds,
+    )
     lower, upper = corners
 
     size = np.array([normal_map.width, normal_map.height], np.float64)
@@ -131,12 +150,16 @@ def binned_pndf(normal_map: NormalMap, uv: npt.ArrayLike, covariance: npt.ArrayL
     # Binomial, with one more sample of each outcome: never zero, and never too small in the mean.
     probability = (counts + 1) / (samples + 2)
     standard_error = np.sqrt(probability * (1 - probability) / samples) / bin_area
-    return BinnedPNDF(density.reshape(res, res), standard_error.reshape(res, res),
-                      (tuple(lower.tolist()), tuple(upper.tolist())))
+    return BinnedPNDF(
+        density.reshape(res, res),
+        standard_error.reshape(res, res),
+        (tuple(lower.tolist()), tuple(upper.tolist())),
+    )
 
 
-def texel_covariance(normal_map: NormalMap, sigma: float | tuple[float, float],
-                     angle: float = 0.0) -> Array:
+def texel_covariance(
+    normal_map: NormalMap, sigma: float | tuple[float, float], angle: float = 0.0
+) -> Array:
     """The UV² covariance of a footprint given in texels.
 
     ``sigma`` is the standard deviation along both axes, or a pair along two axes of which the first
@@ -165,13 +188,15 @@ def normal_bounds(normal_map: NormalMap, epsilon: float = 1e-6, sigma_r: float =
 # One step of the estimate each
 # -------------------------------------------------------------------------------------------------
 
+
 def _checked_covariance(covariance: npt.ArrayLike, owner: str) -> Array:
     matrix = np.asarray(covariance, np.float64)
     valid = matrix.shape == (2, 2) and bool(np.isfinite(matrix).all())
     if valid:
         tolerance = 1e-9 * np.abs(matrix).max()
-        valid = (abs(matrix[0, 1] - matrix[1, 0]) <= tolerance
-                 and bool((np.linalg.eigvalsh(matrix) >= -tolerance).all()))
+        valid = abs(matrix[0, 1] - matrix[1, 0]) <= tolerance and bool(
+            (np.linalg.eigvalsh(matrix) >= -tolerance).all()
+        )
     check(valid, owner, "covariance", "a symmetric positive semidefinite 2 x 2 matrix", covariance)
     return matrix
 

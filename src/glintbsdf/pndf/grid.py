@@ -32,6 +32,10 @@ UV_RESOLUTION = 2.0**-22
 #: Half the shortest median that is walked, in cells. It keeps the weights free of 0/0.
 MIN_HALF_MEDIAN = 1e-3
 
+#: What the median loses at each end, in smaller extents of the pixel: the paper's half a cell, and
+#: a little more, so that pixels which are round but for the perspective need no third column.
+SHORTENED = 0.55
+
 #: The smallest roughness that Mitsuba's Beckmann distribution, which is sampled, can have.
 MIN_ALPHA = 1e-4
 
@@ -71,8 +75,8 @@ class CoveredCells:
     centre. The pixel is a rectangle on the principal axes of the footprint, one standard deviation
     to either side. Its smaller extent selects the grids; the median of the larger one is walked
     column by column (row by row, where it is steeper than 45°). A column weighs as much of the
-    median, shortened at both ends by half the smaller extent, as its tent sees; within a column the
-    tents of the two nearest vertices weigh. All weights sum to one and change continuously.
+    median, shortened at both ends by ``SHORTENED`` of the smaller extent, as its tent sees; within
+    a column the tents of the two nearest vertices weigh. All weights sum to one and change continuously.
 
     Args:
         footprint (Footprint): the footprint.
@@ -105,7 +109,7 @@ class CoveredCells:
         self.along_x = a >= c
         rise = squared_major - dr.minimum(a, c)
         self.slope = dr.select(rise > 0, b / dr.select(rise > 0, rise, 1), 0)
-        half = dr.maximum(dr.sqrt(squared_major) - 0.5 * size, 0)
+        half = dr.maximum(dr.sqrt(squared_major) - SHORTENED * size, 0)
         self.half = half * dr.rsqrt(1 + dr.square(self.slope))
         self.centre = self.swapped(footprint.uv * scale * stretch)
 
@@ -240,11 +244,18 @@ class ReflectingCount:
         # P(N = 0) ≥ 1 − n P: most cells hold nothing that reflects, and this saves their search
         some = active & few & (u >= 1 - mean)
         (count,) = dr.if_stmt(
-            (n, mi.Bool(some)),
+            (mi.Float(0),),
+            active & ~few,
+            lambda count: (self.approximate(gaussian(bits), n),),
+            lambda count: (count,),
+            label="many",
+        )
+        (count,) = dr.if_stmt(
+            (count,),
             some,
-            lambda n, some: (self.exact(u, n, some),),
-            lambda n, some: (dr.select(few, 0, self.approximate(gaussian(bits), n)),),
-            label="count",
+            lambda count: (self.exact(u, n, some),),
+            lambda count: (count,),
+            label="few",
         )
         return dr.select(self.inverted, n - count, count)
 
