@@ -76,7 +76,8 @@ class CoveredCells:
     to either side. Its smaller extent selects the grids; the median of the larger one is walked
     column by column (row by row, where it is steeper than 45°). A column weighs as much of the
     median, shortened at both ends by ``SHORTENED`` of the smaller extent, as its tent sees; within
-    a column the tents of the two nearest vertices weigh. All weights sum to one and change continuously.
+    a column the tents of the two nearest vertices weigh. All weights sum to one and change
+    continuously.
 
     Args:
         footprint (Footprint): the footprint.
