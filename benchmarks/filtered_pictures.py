@@ -4,9 +4,11 @@
 
 The first picture shows the distribution of normals under one footprint of a few dozen bumps: the
 binned reference, every glint method, every filter. The second shows the curved patch: brute force
-with its measured noise, then the same materials. Needs matplotlib. What is printed is the relative
+with its measured noise, then the same materials with footprints as large as a pixel, whatever the
+number of samples. Needs matplotlib. What is printed is the relative
 L1 difference to the reference, and the relative root mean square difference to the truth, whose
-own noise is subtracted. Expected: glint methods at the noise, filters far from it.
+own noise is subtracted. Expected: glint
+methods nearest to it, for a footprint is not the very pixel of a box filter; filters far from it.
 """
 
 from __future__ import annotations
@@ -30,11 +32,11 @@ from curved_patch import MAP, UV_SCALE, curved_patch  # noqa: E402
 from glintbsdf.footprint import Footprint  # noqa: E402
 from glintbsdf.pndf.filtered import METHODS  # noqa: E402
 from glintbsdf.reference import binned_pndf, texel_covariance  # noqa: E402
-from glintbsdf.rendering import render  # noqa: E402
+from glintbsdf.rendering import pixel_angle  # noqa: E402
 from glintbsdf.truth import mirrors, reference_render  # noqa: E402
 
 #: Radius of the lights of the images: brute force finds the scene's own too seldom.
-LIGHT_RADIUS = 0.15
+LIGHT_RADIUS = 0.07
 
 #: Glint methods of a normal map, by their titles: a new one is one more line.
 GLINTS = {
@@ -79,14 +81,21 @@ def images(map_file: Path, size: int, spp: int, truth_spp: int) -> tuple[dict, d
     normal_map = glintbsdf.NormalMap.load(map_file)
     to_uv = mi.ScalarTransform4f().scale([UV_SCALE, UV_SCALE, 1])
     material = mirrors(normal_map, to_uv=to_uv, material="Cr")
-    truth = reference_render(curved_patch(material, size, truth_spp, LIGHT_RADIUS), spp=truth_spp)
+    scene = curved_patch(material, size, truth_spp, LIGHT_RADIUS)
+    truth = reference_render(scene, spp=truth_spp)
+    angle = pixel_angle(scene.sensors()[0])
     print(f"truth: {truth_spp} samples per pixel, noise {truth.relative_error:.3f} of the mean")
     panels, errors = {"truth": truth.image}, {"noise of the truth": truth.relative_error}
     for title, description in (GLINTS | FILTERS).items():
-        scene = curved_patch(
-            {**description, "filename": str(map_file), "to_uv": to_uv, "material": "Cr"}, size, spp
-        )
-        panels[title] = np.array(render(scene, spp=spp))[..., :3]
+        material = {
+            **description,
+            "filename": str(map_file),
+            "to_uv": to_uv,
+            "material": "Cr",
+            "pixel_spread": angle,
+        }
+        scene = curved_patch(material, size, spp, LIGHT_RADIUS)
+        panels[title] = np.array(mi.render(scene, spp=spp))[..., :3]
         errors[title] = truth.relative_rmse(panels[title])
         print(
             f"image  {title:24} relative RMSE {errors[title]:6.3f}, mean"
