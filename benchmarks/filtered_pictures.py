@@ -4,11 +4,11 @@
 
 The first picture shows the distribution of normals under one footprint of a few dozen bumps: the
 binned reference, every glint method, every filter. The second shows the curved patch: brute force
-with its measured noise, then the same materials with footprints as large as a pixel, whatever the
-number of samples. Needs matplotlib. What is printed is the relative
-L1 difference to the reference, and the relative root mean square difference to the truth, whose
-own noise is subtracted. Expected: glint
-methods nearest to it, for a footprint is not the very pixel of a box filter; filters far from it.
+with its measured noise, then the same materials, whose footprints have the variance of a pixel,
+whatever the number of samples. Needs matplotlib. What is printed is the relative L1 difference to
+the reference, and the relative root mean square difference to the truth, whose own noise is
+subtracted. Expected: glint methods nearest to the truth, but not at its noise, for a Gaussian is no
+pixel; filters far from it.
 """
 
 from __future__ import annotations
@@ -93,6 +93,7 @@ def images(map_file: Path, size: int, spp: int, truth_spp: int) -> tuple[dict, d
             "to_uv": to_uv,
             "material": "Cr",
             "pixel_spread": angle,
+            "footprint_sigma": 12**-0.5,
         }
         scene = curved_patch(material, size, spp, LIGHT_RADIUS)
         panels[title] = np.array(mi.render(scene, spp=spp))[..., :3]
@@ -128,7 +129,7 @@ def main() -> None:
     parser.add_argument("--sigma", type=float, default=12.0, help="of the P-NDF, texels")
     parser.add_argument("--res", type=int, default=128, help="bins per axis of the P-NDF")
     parser.add_argument("--size", type=int, default=160, help="pixels per axis of the images")
-    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--spp", type=int, default=512)
     parser.add_argument("--truth-spp", type=int, default=8192)
     parser.add_argument("-o", "--output", type=Path, default=Path("."), help="folder to write to")
     options = parser.parse_args()
