@@ -195,6 +195,9 @@ class Filtered:
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
 
+    # The reference of what is filtered: the Gaussian footprint, and a mesh without clamped triangles.
+    kernel, epsilon = "gaussian", 0.0
+
     def __init__(
         self,
         normal_map: NormalMap,
@@ -224,6 +227,7 @@ class Filtered:
 
     def build(self, normal_map: NormalMap) -> None:
         """Check the slopes, and make the MIP chain of ``self.data``."""
+        self.normal_map = normal_map
         z_squared = 1 - (normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
         check_texels(
             self.owner,
