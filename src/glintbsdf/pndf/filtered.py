@@ -195,7 +195,7 @@ class Filtered:
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
 
-    # The reference of what is filtered: the Gaussian footprint, and a mesh without clamped triangles.
+    # What the reference is to do alike: a Gaussian footprint, no clamped triangles.
     kernel, epsilon = "gaussian", 0.0
 
     def __init__(
