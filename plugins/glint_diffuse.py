@@ -155,24 +155,6 @@ class GlintDiffuse(FootprintBSDF):
         bs.sampled_component = 0
         return bs, value / dr.select(bs.pdf > 0, bs.pdf, 1)
 
-    def eval(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Spectrum:
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Float:
-        return self.eval_pdf(ctx, si, wo, active)[1]
-
     def eval_pdf(
         self,
         ctx: mi.BSDFContext,

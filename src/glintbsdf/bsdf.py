@@ -52,6 +52,26 @@ class FootprintBSDF(mi.BSDF):
                 value,
             )
 
+    # A value and its density take one and the same query, in ``eval_pdf``. What a caller does not
+    # use, Dr.Jit leaves out of the kernel.
+    def eval(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Spectrum:
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool = True,
+    ) -> mi.Float:
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
     def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
         """The footprint at ``si`` in the UV space of the map."""
         footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
@@ -171,24 +191,6 @@ class GlintBSDF(FootprintBSDF):
         weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
         return bs, self.reflected(weight, ctx, si, si.wi, wo, m, footprint, active)
 
-    def eval(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Spectrum:
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        wo: mi.Vector3f,
-        active: mi.Bool = True,
-    ) -> mi.Float:
-        return self.eval_pdf(ctx, si, wo, active)[1]
-
     def eval_pdf(
         self,
         ctx: mi.BSDFContext,
@@ -196,7 +198,6 @@ class GlintBSDF(FootprintBSDF):
         wo: mi.Vector3f,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        # One P-NDF query serves both. What a caller does not use, Dr.Jit leaves out of the kernel.
         cos_theta_i = mi.Frame3f.cos_theta(si.wi)
         active = mi.Bool(active) & (cos_theta_i > 0) & (mi.Frame3f.cos_theta(wo) > 0)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
