@@ -221,6 +221,20 @@ def test_interruption_leaves_nothing(folder, variant):
     assert set(folder.iterdir()) == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
+def test_interruption_under_another_name():
+    """Dr.Jit's loops and Mitsuba's constructors replace the exception that ends them."""
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), cli.interruptible():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("dr.while_loop(): encountered an exception") from error
+    with pytest.raises(RuntimeError, match="of its own"), cli.interruptible():
+        raise RuntimeError("of its own")
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
 # ---------------------------------------------------------------------------------------------
 #  Footprints and passes
 # ---------------------------------------------------------------------------------------------

@@ -6,7 +6,10 @@ Only what concerns the terminal is here; the work is done in other modules.
 from __future__ import annotations
 
 import re
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -30,9 +33,10 @@ def main() -> NoReturn:
     """
     debug = "--debug" in sys.argv[1:]
     try:
-        status = commands.main(prog_name="glintbsdf", standalone_mode=False)
+        with interruptible():
+            status = commands.main(prog_name="glintbsdf", standalone_mode=False)
         sys.exit(status if isinstance(status, int) else 0)
-    except click.Abort:
+    except (click.Abort, KeyboardInterrupt):
         sys.exit("Aborted.")
     except click.ClickException as error:
         click.echo(f"Error: {one_line(error.format_message())}", err=True)
@@ -41,6 +45,31 @@ def main() -> NoReturn:
         if debug:
             raise
         sys.exit(f"Error: {one_line(str(error)) or type(error).__name__}")
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C end the block as KeyboardInterrupt, whatever the libraries below make of it.
+
+    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error of
+    their own in its place.
+    """
+    received = False
+
+    def receive(number: int, frame: object) -> None:
+        nonlocal received
+        received = True
+        signal.default_int_handler(number, frame)
+
+    previous = signal.signal(signal.SIGINT, receive)
+    try:
+        yield
+    except Exception as error:
+        if received:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def one_line(message: str) -> str:

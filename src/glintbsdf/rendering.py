@@ -31,13 +31,7 @@ def load_scene(filename: str | Path, parameters: Mapping[str, str] | None = None
     """
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
-    try:
-        return mi.load_file(str(filename), **(parameters or {}))
-    except RuntimeError as error:
-        # Mitsuba makes its own error of what a plugin's constructor raises, Ctrl-C too.
-        if "KeyboardInterrupt" in str(error):
-            raise KeyboardInterrupt from error
-        raise
+    return mi.load_file(str(filename), **(parameters or {}))
 
 
 def pixel_angle(sensor: mi.Sensor) -> float:
