@@ -51,8 +51,8 @@ def main() -> NoReturn:
 def interruptible() -> Iterator[None]:
     """Let Ctrl-C end the block as KeyboardInterrupt, whatever the libraries below make of it.
 
-    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error of
-    their own in its place.
+    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error
+    of their own in its place.
     """
     received = False
 
