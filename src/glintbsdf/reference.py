@@ -70,8 +70,8 @@ class BinnedPNDF:
     def noise_floor(self) -> float:
         """The :meth:`relative_l1` that an exact density would show, from the noise of this one.
 
-        The mean of |x| of a Gaussian is √(2/π) of its standard deviation. Bins without a sample are
-        left out: they hide less mass than one sample has.
+        The mean of ``|x|`` of a Gaussian is √(2/π) of its standard deviation. Bins without a sample
+        are left out: they hide less mass than one sample has.
         """
         noise = self.standard_error[self.density > 0].sum() / self.density.sum()
         return float(np.sqrt(2 / np.pi) * noise)
@@ -95,7 +95,7 @@ def binned_pndf(
     ``uv`` is the footprint's centre. ``covariance`` is its covariance in UV², a symmetric positive
     semidefinite 2 x 2 matrix; see :func:`texel_covariance` for a footprint given in texels. With ρ
     the Mahalanobis distance, ``kernel`` is ``gaussian`` (cut at ρ <= 3 and renormalised), ``disk``
-    (uniform over ρ <= 1.5) or ``box`` (uniform over |Δu| <= 1.5 σ_u, |Δv| <= 1.5 σ_v, the
+    (uniform over ρ <= 1.5) or ``box`` (uniform over ``|Δu| <= 1.5 σ_u``, ``|Δv| <= 1.5 σ_v``, the
     covariance's diagonal). ``epsilon`` is the Jacobian clamp, ``sigma_r`` the standard deviation of
     a further isotropic Gaussian roughness on the disk. ``bounds`` is the rectangle of the grid
     (default :func:`normal_bounds`); normals outside it count in no bin, so the grid's sum times the
