@@ -12,6 +12,15 @@ axis, as texture hardware does (Heckbert, "Fundamentals of Texture Mapping and I
 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping", SIGGRAPH
 1999).
 
+Accuracy (``benchmarks/filtered_accuracy.py``, 512² maps from isotropic to scratched): where the
+minor axis has a standard deviation of at least 1.2 texels, and a 16th of the major one, the slopes'
+first and second moments are those of the continuous map under the footprint to 0.6 % and 0.9 %,
+root mean square over random footprints, relative to the map's root mean square slope and to its
+square. Narrower footprints mix the texels themselves in, whose mean squares exceed those of the
+interpolated normals: 1 to 9 % off at one texel, 2 to 42 % at half a texel. Nothing cheap mends
+that: levels of half a texel would take 2.9 times the memory; six by six points of the mesh, which
+alone take whole renders from 1.2 to 1.3 × ``roughconductor``, are still 3 % off at one texel.
+
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
 
