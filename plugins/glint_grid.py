@@ -157,12 +157,11 @@ Materials" (:cite:`Zirr16Multiscale`).
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
 from glintbsdf.footprint import Footprint
-from glintbsdf.microfacet import BeckmannMasking, VisibleBeckmannNormals
+from glintbsdf.microfacet import BeckmannLobe, VisibleBeckmannNormals
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import Grid
 from glintbsdf.pndf.grid import Palette, Wheel
@@ -197,15 +196,15 @@ class GlintGrid(GlintBSDF):
 
     def derive(self) -> None:
         """What depends on the roughness."""
-        self.visible_normals = VisibleBeckmannNormals(self.pndf.alpha)
-        self.masking = BeckmannMasking(dr.square(self.pndf.alpha), height_correlated=False)
+        self.smooth = BeckmannLobe(self.pndf.alpha)
+        self.masking = self.smooth.masking
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
         self.derive()
 
     def normals(self) -> VisibleBeckmannNormals:
-        return self.visible_normals
+        return self.smooth.normals
 
     def density(
         self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool

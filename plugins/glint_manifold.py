@@ -171,7 +171,7 @@ import mitsuba as mi
 from glintbsdf.bsdf import GlintBSDF
 from glintbsdf.errors import check
 from glintbsdf.kernels import KERNELS
-from glintbsdf.microfacet import MapBeckmannMasking
+from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import ClusteredManifold, HandOver, Manifold, TabulatedManifold
 from glintbsdf.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
@@ -212,6 +212,7 @@ class GlintManifold(GlintBSDF):
             "beckmann": lambda: MapBeckmannMasking(self.pndf, height_correlated),
             "none": lambda: None,
         }[masking]()
+        self.smooth = MapBeckmannLobe(self.pndf)
         hand_over = parameters.number("hand_over", 0.0)
         if hand_over:
             self.pndf = HandOver(self.pndf, hand_over, self.owner)

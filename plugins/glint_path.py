@@ -20,7 +20,11 @@ Path tracer with footprints (:monosp:`glint_path`)
    - |bool|
    - Hide directly visible emitters. (Default: no, i.e. |false|)
 
-This is Mitsuba's :ref:`path <integrator-path>` (BSDF and emitter sampling, combined by multiple
+ * - separate
+   - |bool|
+   - Separate direct and indirect illumination, see below. (Default: no, i.e. |false|)
+
+This is Mitsuba's :monosp:`path` (BSDF and emitter sampling, combined by multiple
 importance sampling), with one addition: the surface interaction that it hands to a BSDF carries
 the UV partials ``duv_dx`` and ``duv_dy`` of the pixel, at *every* hit. Glint BSDFs average their
 normals over this footprint. The stock integrators leave the partials at zero in Mitsuba's JIT
@@ -41,18 +45,37 @@ For scenes without glint BSDFs (or other BSDFs that read UV partials) the image 
 ``path``, sample by sample. Participating media are not handled, and only JIT variants are
 supported. The partials are treated as constants when the rendering is differentiated.
 
+**Separated illumination.** Light that has been scattered before it arrives comes from everywhere,
+and what glints add to its reflection is noise rather than something to see. With
+:monosp:`separate` on, glints are therefore kept to *direct* light, and glint BSDFs show *indirect*
+light their smooth counterpart, the Beckmann lobe of the roughness that all their glints have
+together :cite:`Tan2022`: that of the whole map, or :monosp:`alpha` of :monosp:`glint_grid`. Paths
+behind the first bounce become cheaper and cleaner, and the indirect image can be denoised without a
+glint being smoothed away, which ``glintbsdf render --denoise`` does.
+
+Direct is the light that one straight segment brings to the first surface that is not a mirror,
+smooth glass or an opening of a mask: what these show counts as seen by the camera, so that glints
+stay in mirrors. Emitters that the camera sees count as direct as well. The image then has further
+channels, :monosp:`direct.R`, :monosp:`.G`, :monosp:`.B` and :monosp:`indirect.R`, :monosp:`.G`,
+:monosp:`.B`, which add up to the whole. Two directions are followed where a path first meets a
+rough surface, one by the glints, for emitters only, and one by the smooth lobe. The indirect image
+differs in expectation from that of :monosp:`separate` off as far as the smooth lobe differs from
+the glints. In BSDFs of one's own: see ``glintbsdf.separation``.
+
 .. tabs::
     .. code-tab:: xml
         :name: glint-path-integrator
 
         <integrator type="glint_path">
             <integer name="max_depth" value="8"/>
+            <boolean name="separate" value="true"/>
         </integrator>
 
     .. code-tab:: python
 
         'type': 'glint_path',
-        'max_depth': 8
+        'max_depth': 8,
+        'separate': True
 """
 
 from __future__ import annotations
@@ -62,6 +85,7 @@ import mitsuba as mi
 
 from glintbsdf.errors import check
 from glintbsdf.raycone import RayCone, curved_interaction, lobe_width
+from glintbsdf.separation import smooth_context
 
 
 class GlintPathIntegrator(mi.SamplingIntegrator):
@@ -69,11 +93,14 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)  # reads hide_emitters
+        separate = props.get("separate", False)
         max_depth = props.get("max_depth", -1)
         rr_depth = props.get("rr_depth", 5)
         owner = props.plugin_name()
         check(max_depth >= -1, owner, "max_depth", "-1 (infinite) or a value >= 0", max_depth)
         check(rr_depth > 0, owner, "rr_depth", "greater than zero", rr_depth)
+        check(isinstance(separate, bool), owner, "separate", "true or false", separate)
+        self.separate = separate
         self.max_depth = max_depth if max_depth >= 0 else 0xFFFFFFFF
         self.rr_depth = rr_depth
 
@@ -86,20 +113,26 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        """Radiance along the sensor's rays, whether it belongs to a surface, and no AOVs."""
+        """Radiance along the sensor's rays, whether it belongs to a surface, and the AOVs: none,
+        or direct and indirect light."""
         if dr.hint(self.max_depth == 0, mode="scalar"):
-            return mi.Spectrum(0), mi.Bool(False), []
+            return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
 
         # --------------------- Configure loop state ----------------------
 
         ray = mi.Ray3f(ray_)  # Current ray
         cone = RayCone.from_ray(ray_)  # Its width, for footprints
         active = mi.Bool(active)  # Active SIMD lanes
-        L = mi.Spectrum(0)  # Radiance accumulator
+        L = mi.Spectrum(0)  # Radiance accumulator; of indirect light where it is separate
         β = mi.Spectrum(1)  # Path throughput weight
         η = mi.Float(1)  # Index of refraction
         depth = mi.UInt32(0)  # Depth of current vertex
-        bsdf_ctx = mi.BSDFContext()
+        bsdf_ctx = smooth_context() if self.separate else mi.BSDFContext()
+        glint_ctx = mi.BSDFContext()
+
+        # Separate illumination: direct light, and whether nothing rough lies behind the ray
+        L_direct = mi.Spectrum(0) if self.separate else None
+        seen = mi.Bool(True) if self.separate else None
 
         # Variables caching information from the previous bounce
         si_prev = dr.zeros(mi.Interaction3f)
@@ -126,11 +159,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             # ---------------------- Direct emission ----------------------
 
-            # Weigh the emitter against the chance that emitter sampling would have found it
-            ds = mi.DirectionSample3f(scene, si, si_prev)
-            em_pdf = scene.pdf_emitter_direction(si_prev, ds, ~bsdf_delta_prev)
-            mis = mis_weight(bsdf_pdf_prev, em_pdf)
-            L = spectrum_fma(β, ds.emitter.eval(si, bsdf_pdf_prev > 0) * mis, L)
+            emitted = emission(scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev)
+            if dr.hint(self.separate, mode="scalar"):
+                L_direct[seen] = spectrum_fma(β, emitted, L_direct)
+                L[~seen] = spectrum_fma(β, emitted, L)
+            else:
+                L = spectrum_fma(β, emitted, L)
 
             # Continue tracing the path at this point?
             active_next = (depth + 1 < self.max_depth) & si.is_valid()
@@ -163,24 +197,44 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             # ------ Evaluate BSDF * cos(theta) and sample a direction ------
 
+            sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
             bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
-                bsdf_ctx, si, wo, sampler.next_1d(), sampler.next_2d()
+                bsdf_ctx, si, wo, sample_1, sample_2
             )
             bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
             mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
-            L[active_em] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
+            if dr.hint(self.separate, mode="scalar"):
+                L[active_em & ~seen] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
+            else:
+                L[active_em] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
+            ray_next, bsdf_weight = scatter(bsdf, bsdf_ctx, si, bs, bsdf_weight, active)
 
-            # ---------------------- BSDF sampling ----------------------
+            # ----------- Glints in direct light (separate) -----------
 
-            bsdf_weight = si.to_world_mueller(bsdf_weight, -bs.wo, si.wi)
-            ray_next = si.spawn_ray(si.to_world(bs.wo))
+            if dr.hint(self.separate, mode="scalar"):
+                glints = active_next & seen
+                value, pdf, bs_glint, weight = bsdf.eval_pdf_sample(
+                    glint_ctx, si, wo, sample_1, sample_2, glints
+                )
+                value = si.to_world_mueller(value, -wo, si.wi)
+                mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+                L_direct[active_em & seen] = spectrum_fma(β, value * em_weight * mis_em, L_direct)
 
-            # Samples must not move with the parameters that the image is differentiated by: keep
-            # the direction, and let derivatives reach the BSDF's value only.
-            if dr.hint(dr.grad_enabled(ray_next), mode="scalar"):
-                ray_next = dr.detach(ray_next)
-                value, pdf = bsdf.eval_pdf(bsdf_ctx, si, si.to_local(ray_next.d), active)
-                bsdf_weight[pdf > 0] = value / dr.detach(pdf)
+                # Look for an emitter in the direction of a glint. What mirrors, glass and null
+                # interfaces show is found by the path itself, which goes on along them.
+                glints &= mi.has_flag(bs_glint.sampled_type, mi.BSDFFlags.Smooth)
+                ray_glint, weight = scatter(bsdf, glint_ctx, si, bs_glint, weight, glints)
+                si_glint = scene.ray_intersect(ray_glint, glints)
+                pdf = dr.select(glints, bs_glint.pdf, 0)
+                emitted = emission(scene, si_glint, si, pdf, mi.Bool(False))
+                L_direct[glints] = spectrum_fma(β, weight * emitted, L_direct)
+
+                # A smooth lobe continues the path: emitters that it meets next are not counted
+                seen_next = seen & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                bsdf_pdf_prev = dr.select(seen & ~seen_next, 0, bs.pdf)
+                seen = seen_next
+            else:
+                bsdf_pdf_prev = bs.pdf
 
             # ------ Update loop variables based on current interaction ------
 
@@ -198,7 +252,6 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             # Information about the current vertex needed by the next iteration
             si_prev = mi.Interaction3f(si)
-            bsdf_pdf_prev = bs.pdf
             bsdf_delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
 
             # -------------------- Stopping criterion ---------------------
@@ -216,13 +269,59 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             active = active_next & (~rr_active | rr_continue) & (β_max != 0)
             pi = scene.ray_intersect_preliminary(ray, coherent=False, reorder=True, active=active)
 
+        if dr.hint(self.separate, mode="scalar"):
+            L_direct, L = dr.select(valid, L_direct, 0), dr.select(valid, L, 0)
+            aovs = [*to_rgb(L_direct, ray_), *to_rgb(L, ray_)]
+            return L_direct + L, valid, aovs
         return dr.select(valid, L, 0), valid, []
+
+    def aov_names(self) -> list[str]:
+        """``direct.R`` … ``indirect.B`` where illumination is separate."""
+        parts = ("direct", "indirect") if self.separate else ()
+        return [f"{part}.{channel}" for part in parts for channel in "RGB"]
 
     def to_string(self) -> str:
         return (
             f"GlintPathIntegrator[\n  max_depth = {self.max_depth},\n"
-            f"  rr_depth = {self.rr_depth}\n]"
+            f"  rr_depth = {self.rr_depth},\n  separate = {self.separate}\n]"
         )
+
+
+def emission(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    si_prev: mi.Interaction3f,
+    pdf_prev: mi.Float,
+    delta_prev: mi.Bool,
+) -> mi.Spectrum:
+    """What the emitter at ``si``, if any, sends to ``si_prev``, where a BSDF sample of density
+    ``pdf_prev`` has found it: weighed against the chance that emitter sampling would have. Zero
+    where the density is zero."""
+    ds = mi.DirectionSample3f(scene, si, si_prev)
+    em_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
+    return ds.emitter.eval(si, pdf_prev > 0) * mis_weight(pdf_prev, em_pdf)
+
+
+def scatter(
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    bs: mi.BSDFSample3f,
+    weight: mi.Spectrum,
+    active: mi.Bool,
+) -> tuple[mi.Ray3f, mi.Spectrum]:
+    """The ray in the direction that was sampled, and the sample's weight in world space.
+
+    Samples must not move with the parameters that the image is differentiated by: the direction is
+    kept, and derivatives reach the BSDF's value only.
+    """
+    weight = si.to_world_mueller(weight, -bs.wo, si.wi)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    if dr.grad_enabled(ray):
+        ray = dr.detach(ray)
+        value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ray.d), active)
+        weight[pdf > 0] = value / dr.detach(pdf)
+    return ray, weight
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
@@ -230,6 +329,18 @@ def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     pdf_a, pdf_b = dr.square(pdf_a), dr.square(pdf_b)
     weight = pdf_a / (pdf_a + pdf_b)
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
+
+
+def to_rgb(spectrum: mi.Spectrum, ray: mi.Ray3f) -> list[mi.Float]:
+    """Red, green and blue of a sensor's ray, as Mitsuba's ``aov`` integrator takes them: the
+    sensor is assumed to have drawn the wavelengths by ``sample_rgb_spectrum``."""
+    spectrum = mi.unpolarized_spectrum(spectrum)
+    if mi.is_spectral:
+        pdf = mi.pdf_rgb_spectrum(ray.wavelengths)
+        spectrum = mi.spectrum_to_srgb(
+            spectrum * dr.select(pdf > 0, dr.rcp(pdf), 0), ray.wavelengths
+        )
+    return [spectrum[0]] * 3 if mi.is_monochromatic else list(spectrum)
 
 
 def spectrum_fma(a: mi.Spectrum, b: mi.Spectrum, c: mi.Spectrum) -> mi.Spectrum:

@@ -6,6 +6,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 
@@ -13,6 +16,7 @@ from . import microfacet
 from .errors import check
 from .footprint import Footprint, is_literal_zero
 from .parameters import Parameters
+from .separation import asks_for_smooth_lobes
 
 
 class FootprintBSDF(mi.BSDF):
@@ -108,6 +112,22 @@ class FootprintBSDF(mi.BSDF):
         return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
 
 
+class Facets(NamedTuple):
+    """What a glint BSDF reflects from: its glints, or the smooth lobe that stands for them.
+
+    Attributes:
+        density: the function ``(si, m, footprint, active)`` that gives D of the unit normal m.
+        normals: what normals are drawn from, see :class:`~glintbsdf.microfacet.PndfNormals`.
+        masking: :class:`~glintbsdf.microfacet.SmithMasking`, or None for none.
+        tint: the function ``(si, active)`` that gives the factor on the reflection.
+    """
+
+    density: Callable
+    normals: object
+    masking: microfacet.SmithMasking | None
+    tint: Callable
+
+
 class GlintBSDF(FootprintBSDF):
     """A one-sided glossy BRDF, ``F D G / (4 cosθ_i cosθ_o)``, with D the P-NDF of a footprint.
 
@@ -118,6 +138,9 @@ class GlintBSDF(FootprintBSDF):
         pndf: the P-NDF: ``eval(m, footprint, active)``, the density D over the disk of projected
             normals; ``traverse`` and ``parameters_changed``.
         masking: :class:`~glintbsdf.microfacet.SmithMasking`, or None for none.
+        smooth: :class:`~glintbsdf.microfacet.BeckmannLobe` of the roughness that all glints have
+            together, which takes their place in a ``separation.smooth_context()``; None (the
+            default) where the P-NDF is smooth by itself.
 
     Normals are drawn by the P-NDF's ``sample(footprint, sample1, sample2, active)``, from exactly
     its density. A subclass whose P-NDF cannot do that overrides :meth:`normals`; one whose density
@@ -125,6 +148,8 @@ class GlintBSDF(FootprintBSDF):
 
     Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
     """
+
+    smooth: microfacet.BeckmannLobe | None = None
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -153,8 +178,16 @@ class GlintBSDF(FootprintBSDF):
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
         self.pndf.parameters_changed(keys)
-        if self.masking is not None:
-            self.masking.parameters_changed()
+        for part in (self.masking, self.smooth):
+            if part is not None:
+                part.parameters_changed()
+
+    def facets(self, ctx: mi.BSDFContext) -> Facets:
+        """The glints, or their smooth counterpart where ``ctx`` asks for it."""
+        if self.smooth is not None and asks_for_smooth_lobes(ctx):
+            smooth = self.smooth
+            return Facets(smooth.density, smooth.normals, smooth.masking, self.mean_tint)
+        return Facets(self.density, self.normals(), self.masking, self.tint)
 
     def sample(
         self,
@@ -173,12 +206,12 @@ class GlintBSDF(FootprintBSDF):
         # Draw a normal and reflect about it. One that does not point up, or reflects below the
         # horizon, is an invalid sample: its mass is missing from the pdf as well.
         footprint = self.footprint(si)
-        normals = self.normals()
-        m = normals.sample(si.wi, footprint, sample1, sample2, active)
+        facets = self.facets(ctx)
+        m = facets.normals.sample(si.wi, footprint, sample1, sample2, active)
         wo = mi.reflect(si.wi, mi.Normal3f(m))
         active &= (m.z > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-        density = self.density(si, m, footprint, active)
-        pdf = normals.pdf(si.wi, m, density, footprint, active)
+        density = facets.density(si, m, footprint, active)
+        pdf = facets.normals.pdf(si.wi, m, density, footprint, active)
         active &= pdf > 0
 
         bs.wo = wo
@@ -189,7 +222,7 @@ class GlintBSDF(FootprintBSDF):
 
         value = microfacet.reflected_value(density, dr.select(active, cos_theta_i, 1))
         weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
-        return bs, self.reflected(weight, ctx, si, si.wi, wo, m, footprint, active)
+        return bs, self.reflected(weight, facets, ctx, si, si.wi, wo, m, footprint, active)
 
     def eval_pdf(
         self,
@@ -209,11 +242,12 @@ class GlintBSDF(FootprintBSDF):
         wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
         m = microfacet.half_vector(wi, wo)
         footprint = self.footprint(si)
-        density = self.density(si, m, footprint, active)
+        facets = self.facets(ctx)
+        density = facets.density(si, m, footprint, active)
         value = microfacet.reflected_value(density, wi.z)
-        pdf = self.normals().pdf(wi, m, density, footprint, active)
+        pdf = facets.normals.pdf(wi, m, density, footprint, active)
         return (
-            self.reflected(value, ctx, si, wi, wo, m, footprint, active),
+            self.reflected(value, facets, ctx, si, wi, wo, m, footprint, active),
             dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0),
         )
 
@@ -257,6 +291,7 @@ class GlintBSDF(FootprintBSDF):
     def reflected(
         self,
         value: mi.Float | mi.UnpolarizedSpectrum,
+        facets: Facets,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wi: mi.Vector3f,
@@ -266,9 +301,9 @@ class GlintBSDF(FootprintBSDF):
         active: mi.Bool,
     ) -> mi.Spectrum:
         """``value`` times masking, tint and Fresnel reflectance or Mueller matrix, where active."""
-        if self.masking is not None:
-            value = value * self.masking.eval(wi, wo, footprint, active)
-        tint = self.tint(si, active)
+        if facets.masking is not None:
+            value = value * facets.masking.eval(wi, wo, footprint, active)
+        tint = facets.tint(si, active)
         if mi.is_polarized:
             spectrum = microfacet.mueller_reflection(
                 self.fresnel.index(si, active), value * tint, ctx.mode, wi, wo, m

@@ -306,6 +306,51 @@ class MapBeckmannMasking(BeckmannMasking):
         self.alpha_squared = map_alpha_squared(self.pndf.data)
 
 
+class BeckmannLobe:
+    """The facets of a smooth Beckmann surface, whatever the footprint: ``roughconductor``'s.
+
+    Visible normals, masking and shadowing are separable, as in that plugin of Mitsuba.
+
+    Args:
+        alpha: ``mi.Vector2f``, roughness along u and v, at least 1e-4.
+
+    Attributes:
+        normals (VisibleBeckmannNormals), masking (BeckmannMasking): of these facets.
+    """
+
+    def __init__(self, alpha: mi.Vector2f) -> None:
+        self.normals = VisibleBeckmannNormals(alpha)
+        self.masking = BeckmannMasking(dr.square(alpha), height_correlated=False)
+
+    def density(
+        self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float:
+        """D of the unit normal ``m``; where and how large the footprint is plays no part."""
+        return self.normals.distribution.eval(m)
+
+    def parameters_changed(self) -> None:
+        """Nothing follows from a map."""
+
+
+class MapBeckmannLobe(BeckmannLobe):
+    """The smooth surface as rough as a whole map: what its glints add up to, from afar.
+
+    The roughness is that of :class:`MapBeckmannMasking`: twice the mean squared slope along u and
+    along v. A tilt of the map as a whole counts as roughness, and the two axes as uncorrelated. A
+    flat map has the smallest roughness, 1e-4.
+
+    Args:
+        pndf: the P-NDF whose map ``pndf.data`` (H×W×2 projected normals) gives the roughness.
+    """
+
+    def __init__(self, pndf: object) -> None:
+        self.pndf = pndf
+        self.parameters_changed()
+
+    def parameters_changed(self) -> None:
+        super().__init__(dr.sqrt(dr.maximum(map_alpha_squared(self.pndf.data), 1e-8)))
+
+
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
     """Squared Beckmann roughness of a map of projected normals (H×W×2) along u and v."""
     s = dr.unravel(mi.Vector2f, data.array)
