@@ -51,7 +51,7 @@ class OrenNayarDiffuse:
     Wu24, appendix C: the mean of the projected normals gives the frame, the variance of the slopes
     the roughness, as in LEADR mapping (Dupuy et al. 2013), with σ² half the trace of the slopes'
     covariance. The model is the "qualitative" one of Oren and Nayar, "Generalization of Lambert's
-    Reflectance Model", SIGGRAPH 1994, Eq. 30, without interreflection.
+    Reflectance Model", SIGGRAPH 1994, without interreflection.
 
     Args:
         mesh (TexelMesh): gives the normals; its triangles play no part.
@@ -83,7 +83,7 @@ def slope_moments(m: mi.Vector2f) -> list:
 
 
 def oren_nayar(wi: mi.Vector3f, wo: mi.Vector3f, variance: mi.Float) -> mi.Float:
-    """``f cosθ_o`` of a white rough surface (Oren and Nayar 1994, Eq. 30).
+    """``f cosθ_o`` of a white rough surface (Oren and Nayar 1994).
 
     ``variance``: σ², that of the facets' inclination, radians².
     """

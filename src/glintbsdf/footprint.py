@@ -7,7 +7,7 @@ reduces it to axis-aligned extents.
 
 Sources: Igehy, "Tracing Ray Differentials", SIGGRAPH 1999 (UV partials of a pixel); Yan et al.,
 "Position-Normal Distributions for Efficient Rendering of Specular Microstructure", SIGGRAPH 2016,
-section 4 (the Gaussian footprint).
+section 3 (the Gaussian footprint).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 With ``m`` the half vector of the directions ``wi`` and ``wo`` and ``D`` a density over the disk of
 projected normals (``∫ D d(m_x, m_y) = 1``, hence ``∫ D cosθ_m dω_m = 1``)
 
-    f_r cosθ_o = F D G / (4 cosθ_i)                             (Walter et al. 2007, Eq. 20)
-    pdf(wo)    = D cosθ_m / (4 |wo·m|)                          (Walter et al. 2007, Eq. 14, 24)
+    f_r cosθ_o = F D G / (4 cosθ_i)                         (Walter et al. 2007: BRDF)
+    pdf(wo)    = D cosθ_m / (4 |wo·m|)                      (Walter et al. 2007: sampling)
 
 Directions are unit vectors in the local shading frame, pointing away from the surface.
 
@@ -240,7 +240,7 @@ class SmithMasking:
     Args:
         height_correlated: Whether masking and shadowing count a facet's height once,
             ``1 / (1 + Λ(wi) + Λ(wo))``, rather than as independent events,
-            ``G1(wi) G1(wo)`` (Heitz 2014, section 6).
+            ``G1(wi) G1(wo)`` (Heitz 2014, on the joint masking-shadowing function).
     """
 
     def __init__(self, height_correlated: bool = True) -> None:
@@ -359,7 +359,7 @@ def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
 
 
 def beckmann_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:
-    """Λ(w) of an anisotropic Beckmann surface (Heitz 2014, section 5); 0 for a flat one.
+    """Λ(w) of an anisotropic Beckmann surface (Heitz 2014); 0 for a flat one.
 
     ``Λ = (exp(−a²) / (a √π) − erfc(a)) / 2`` with ``a = cosθ / √(α_u² w_x² + α_v² w_y²)``.
     """

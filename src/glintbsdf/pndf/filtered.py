@@ -34,7 +34,7 @@ def slope(s):
 
 
 def lean_moments(s) -> list:
-    """Olano and Baker 2010, Eq. 6: slopes, and the products of slopes (x², y², xy)."""
+    """LEAN (Olano and Baker 2010): slopes, and the products of slopes (x², y², xy)."""
     b = slope(s)
     return [b.x, b.y, b.x * b.x, b.y * b.y, b.x * b.y]
 
@@ -63,7 +63,7 @@ def normal_moments(s) -> list:
 
 
 def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
-    """LEAN (Olano and Baker 2010, Eq. 5, 8): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``."""
+    """LEAN (Olano and Baker 2010): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``."""
     x, y, xx, yy, xy = averages
     variance_u, variance_v = positive(xx - x * x), positive(yy - y * y)
     covariance = xy - x * y
@@ -342,7 +342,7 @@ class LobeMasking(SmithMasking):
     ``Λ = P/A − 1`` with A the area of the mean facet seen, P that of all facets that face the
     direction (``slope_lobe.py``); 0 where the mean facet faces away. With ``projection`` the
     reflection is that of the mean facet, not of the geometric surface: ``cosθ_i`` in the
-    denominator of the BRDF becomes A (Dupuy et al. 2013, section 3). No more light is reflected
+    denominator of the BRDF becomes A (Dupuy et al. 2013). No more light is reflected
     then than arrives, whatever the mean slope.
 
     Args:
