@@ -14,7 +14,8 @@ Positions are in texels: texel (row i, column j) has its centre at (j, i).
 
 from __future__ import annotations
 
-from math import exp, pi
+from collections.abc import Callable
+from math import pi
 
 import drjit as dr
 import mitsuba as mi
@@ -85,9 +86,13 @@ class TexelKernel:
     The determinant comes from the factor's cross product, so rank-one and 1000:1 footprints keep
     their digits.
 
-    ``added`` (texels²): variance added to Σ along u and v, :data:`SIGMA_MIN` squared by default.
+    Args:
+        added (texels²): variance added to Σ along u and v, :data:`SIGMA_MIN` squared by default.
+        reach: where else than at :data:`REACH` the kernel is cut, as a function that returns the
+            Mahalanobis distance for a minor standard deviation of the footprint (texels).
 
     Attributes:
+        du, dv (mi.Vector2f): the footprint's axes in texels, limited, before ``added``.
         minor_variance (mi.Float): smaller eigenvalue of Σ, texels².
         mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
         reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
@@ -101,6 +106,7 @@ class TexelKernel:
         width: int,
         wrap_mode: str,
         added: tuple = (SIGMA_MIN**2, SIGMA_MIN**2),
+        reach: Callable[[mi.Float], mi.Float] | None = None,
     ) -> None:
         check_choice("TexelKernel", "kernel", kernel, KERNELS)
         self.kernel = kernel
@@ -115,7 +121,7 @@ class TexelKernel:
         self.mean = mi.Point2f(dr.fma(uv, size, -0.5))
 
         du, dv = limit_extent(footprint.du, footprint.dv)
-        du, dv = du * size, dv * size
+        du, dv = self.du, self.dv = du * size, dv * size
         own_u, own_v = dr.fma(du.x, du.x, dv.x * dv.x), dr.fma(du.y, du.y, dv.y * dv.y)
         added_u, added_v = added
         variance_u, variance_v = own_u + added_u, own_v + added_v
@@ -131,14 +137,15 @@ class TexelKernel:
         self.sigma_u, self.sigma_v = dr.sqrt(variance_u), dr.sqrt(variance_v)
         self.shear = covariance / variance_v
         self.sigma_u_given_v = dr.sqrt(determinant / variance_v)
-        reach = REACH[kernel]
+        reach = REACH[kernel] if reach is None else reach(dr.sqrt(self.minor_variance))
+        self.reach = reach
         self.reach_u, self.reach_v = reach * self.sigma_u, reach * self.sigma_v
         if kernel == "box":
             self.peak = dr.rcp(4 * self.reach_u * self.reach_v)
         else:
             self.inverse_u_given_v = dr.rcp(self.sigma_u_given_v)
             self.inverse_v = dr.rcp(self.sigma_v)
-            mass = 2 * pi * (1 - exp(-0.5 * reach**2)) if kernel == "gaussian" else pi * reach**2
+            mass = 2 * pi * (1 - dr.exp(-0.5 * reach**2)) if kernel == "gaussian" else pi * reach**2
             self.peak = self.inverse_u_given_v * self.inverse_v / mass
             # Row at which the ellipse reaches furthest to the right.
             self.row_of_reach_u = reach * covariance / self.sigma_u
@@ -151,14 +158,14 @@ class TexelKernel:
         u = dr.fma(-self.shear, offset.y, offset.x) * self.inverse_u_given_v
         v = offset.y * self.inverse_v
         rho2 = dr.fma(u, u, v * v)
-        inside = rho2 <= REACH[self.kernel] ** 2
+        inside = rho2 <= self.reach**2
         if self.kernel == "disk":
             return dr.select(inside, self.peak, 0)
         return dr.select(inside, self.peak * dr.exp(-0.5 * rho2), 0)
 
     def sample(self, sample):
         """Draw an offset Δ (texels) with density k from ``sample`` in [0, 1)²."""
-        reach = REACH[self.kernel]
+        reach = self.reach
         if self.kernel == "box":
             return mi.Vector2f(
                 self.reach_u * dr.fma(2, sample.x, -1), self.reach_v * dr.fma(2, sample.y, -1)
@@ -166,7 +173,7 @@ class TexelKernel:
         if self.kernel == "disk":
             rho = reach * dr.sqrt(sample.x)
         else:
-            rho = dr.sqrt(-2 * dr.log(1 - sample.x * (1 - exp(-0.5 * reach**2))))
+            rho = dr.sqrt(-2 * dr.log(1 - sample.x * (1 - dr.exp(-0.5 * reach**2))))
         sin_phi, cos_phi = dr.sincos(2 * pi * sample.y)
         v = self.sigma_v * rho * sin_phi
         return mi.Vector2f(dr.fma(self.shear, v, self.sigma_u_given_v * rho * cos_phi), v)
@@ -186,7 +193,7 @@ class TexelKernel:
         def edge(sign):
             v = dr.clip(sign * self.row_of_reach_u, top, bottom)
             z = v * self.inverse_v
-            half = self.sigma_u_given_v * dr.safe_sqrt(REACH[self.kernel] ** 2 - z * z)
+            half = self.sigma_u_given_v * dr.safe_sqrt(self.reach**2 - z * z)
             return dr.fma(self.shear, v, sign * half)
 
         return edge(-1), edge(1)

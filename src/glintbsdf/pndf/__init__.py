@@ -1,10 +1,19 @@
 """Estimators of the P-NDF, the distribution of normals seen through a footprint."""
 
 from .clustered import ClusteredManifold
+from .elements import Elements
 from .filtered import Filtered
 from .grid import Grid
 from .hand_over import HandOver
 from .manifold import Manifold
 from .tabulated import TabulatedManifold
 
-__all__ = ["ClusteredManifold", "Filtered", "Grid", "HandOver", "Manifold", "TabulatedManifold"]
+__all__ = [
+    "ClusteredManifold",
+    "Elements",
+    "Filtered",
+    "Grid",
+    "HandOver",
+    "Manifold",
+    "TabulatedManifold",
+]

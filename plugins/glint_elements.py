@@ -1,0 +1,199 @@
+r"""
+.. _bsdf-glint_elements:
+
+Glints of Gaussian elements (:monosp:`glint_elements`)
+------------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Image file of the normal or height map: OpenEXR, PNG, TIFF and what else Mitsuba reads. A
+     relative name counts from the scene's folder.
+
+ * - bitmap
+   - :monosp:`mitsuba.Bitmap`
+   - The map itself, instead of :monosp:`filename`, when the scene is built in Python.
+
+ * - data
+   - |tensor|
+   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
+     the map in use: the projected normals, H×W×2.
+   - |exposed|, |differentiable|
+
+ * - map_type
+   - |string|
+   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z) in [−1, 1]; :monosp:`height`, which
+     gives normals ∝ (−∂h/∂x, −∂h/∂y, 1); or :monosp:`auto`, a height where there is one channel or
+     all channels are equal. Files of unsigned integers are decoded from [0, 1].
+     (Default: :monosp:`auto`)
+
+ * - height_scale
+   - |float|
+   - Texels per unit of height. (Default: 1)
+
+ * - wrap_mode
+   - |string|
+   - What lies beyond the map's border: :monosp:`repeat`, :monosp:`mirror` or :monosp:`clamp`.
+     (Default: :monosp:`repeat`)
+
+ * - to_uv
+   - |transform|
+   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
+   - |exposed|
+
+ * - sigma_r
+   - |float|
+   - Intrinsic roughness: the standard deviation of a projected normal, in [1e-8, 1]. Glints of
+     flat places of the map are this wide. (Default: 0.005)
+   - |exposed|, |differentiable|
+
+ * - step
+   - |float|
+   - Distance of the elements, in texels: 0.5 for accuracy, 1 for speed. It is rounded so that a
+     whole number of steps makes the map. (Default: 0.5)
+
+ * - elements
+   - |string|
+   - Whether elements follow the map's curvature, :monosp:`curved`, or have one normal each,
+     :monosp:`flat`, as the facets of a rugged surface. (Default: :monosp:`curved`)
+
+ * - flake_density
+   - |float|
+   - Metallic flakes instead of a map: number of flakes per unit of UV area. They lie at random, no
+     two too close, on the unit UV square, which repeats.
+
+ * - flake_alpha
+   - |float|
+   - Beckmann roughness from which each flake draws its normal. (Default: 0.2)
+
+ * - seed
+   - |int|
+   - Another number gives other flakes. (Default: 0)
+
+ * - masking
+   - |string|
+   - Masking and shadowing: :monosp:`beckmann`, that of a Beckmann surface as rough as the whole map
+     or as the flakes, or :monosp:`none`. (Default: :monosp:`beckmann`)
+
+ * - footprint_sigma
+   - |float|
+   - Standard deviation of the footprint, in pixels. (Default: 0.5)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - pixel_spread
+   - |float|
+   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
+     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
+     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - material
+   - |string|
+   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
+
+ * - eta, k
+   - |spectrum| or |texture|
+   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
+     (Default: 0 and 1 where only the other is given)
+   - |exposed|, |differentiable|, |discontinuous|
+
+ * - int_ior, ext_ior
+   - |float| or |string|
+   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
+     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
+     :monosp:`bk7` and :monosp:`air` where only the other is given)
+
+ * - specular_reflectance
+   - |spectrum| or |texture|
+   - Factor on the reflection, in [0, 1]. (Default: 1)
+   - |exposed|, |differentiable|
+
+The glints of a surface whose normals come from a high-resolution map, or from metallic flakes. As
+in :cite:`Yan16PositionNormal`, the surface is a mixture of *elements*: Gaussians in position ×
+normal space, :monosp:`step` texels apart, each aligned with the normals of the map around it. The
+P-NDF, the distribution of the normals under a pixel's footprint, is then a sum in closed form,
+
+.. math::
+
+    D(m) = \frac{1}{W} \sum_i w_i\, \mathcal{N}(m;\ s_i + J_i \mu_i,\ \sigma_r^2 I + J_i C J_i^T)
+
+where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\mu_i` and
+:math:`C` the mean and covariance of the places at which the footprint sees it, and
+:math:`W = \sum_i w_i`. Sampling draws from exactly this density. Unlike that of
+:ref:`glint_manifold <bsdf-glint_manifold>`, it is smooth: roughness :math:`\sigma_r` is part of it.
+
+Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,
+and the lists of elements by normal, which large footprints are evaluated with, up to 42.
+
+The sum is cut where elements weigh little: at 3 to 4 standard deviations of the footprint, and of
+the normals of an element; the integral of :math:`D` is one within 1e-3.
+
+Flakes share the whole surface among them. What shows between flakes is for a blend with another
+material to say.
+
+The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
+inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
+coordinates.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: lst-glint_elements
+
+        <bsdf type="glint_elements">
+            <string name="filename" value="scratches.exr"/>
+            <transform name="to_uv">
+                <scale x="4" y="4"/>
+            </transform>
+            <float name="sigma_r" value="0.005"/>
+            <string name="material" value="Al"/>
+        </bsdf>
+
+        <bsdf type="glint_elements">
+            <float name="flake_density" value="1e5"/>
+            <float name="flake_alpha" value="0.15"/>
+            <string name="material" value="Al"/>
+        </bsdf>
+
+    .. code-tab:: python
+
+        'type': 'glint_elements',
+        'filename': 'scratches.exr',
+        'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
+        'sigma_r': 0.005,
+        'material': 'Al'
+
+Reference: Ling-Qi Yan, Miloš Hašan, Steve Marschner and Ravi Ramamoorthi, "Position-Normal
+Distributions for Efficient Rendering of Specular Microstructure" (:cite:`Yan16PositionNormal`),
+section 5.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from glintbsdf.bsdf import GlintBSDF
+from glintbsdf.microfacet import MapBeckmannMasking
+from glintbsdf.parameters import Parameters
+from glintbsdf.pndf import Elements
+
+
+class GlintElements(GlintBSDF):
+    """The plugin ``glint_elements``."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        parameters = Parameters(props)
+        sigma_r = parameters.number("sigma_r", 0.005)
+        self.pndf = Elements(
+            parameters.normal_map(),
+            sigma_r,
+            step=parameters.number("step", 0.5),
+            curved=parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
+            owner=self.owner,
+        )
+        masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
+        self.masking = MapBeckmannMasking(self.pndf) if masking == "beckmann" else None
+
+
+mi.register_bsdf("glint_elements", lambda props: GlintElements(props))
