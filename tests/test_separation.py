@@ -179,7 +179,9 @@ def test_smooth_lobe_follows_the_map(variant):
 # ------------------------------------ glint_path ------------------------------------
 
 
-def room(metal: dict, **overrides) -> mi.Scene:
+def room(
+    metal: dict, size: int = 24, pixel_format: str = "rgb", sampler=None, **overrides
+) -> mi.Scene:
     """A plate and a diffuse wall that light one another, an area light, and an environment."""
     transform = mi.ScalarTransform4f()
     return mi.load_dict(
@@ -189,7 +191,14 @@ def room(metal: dict, **overrides) -> mi.Scene:
                 "type": "perspective",
                 "fov": 40,
                 "to_world": transform.look_at([0, -4, 3], [0, 0, 0.4], [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 24, "height": 24, "filter": {"type": "box"}},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "pixel_format": pixel_format,
+                    "filter": {"type": "box"},
+                },
+                "sampler": sampler or {"type": "independent"},
             },
             "plate": {"type": "rectangle", "to_world": transform.scale(2), "bsdf": metal},
             "wall": {

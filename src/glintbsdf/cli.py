@@ -173,6 +173,12 @@ def _define_option(meaning: str):
     "--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]"
 )
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option(
+    "--denoise",
+    is_flag=True,
+    help="Denoise the indirect light; direct light, and so all glints, stay as they are. Needs the "
+    'integrator "glint_path".',
+)
 @_define_option("Parameter of the scene; may be repeated.")
 def render(
     scene: Path,
@@ -180,6 +186,7 @@ def render(
     variant: str,
     spp: int | None,
     seed: int,
+    denoise: bool,
     definitions: dict[str, str],
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
@@ -192,7 +199,7 @@ def render(
         # Plugins show the progress of what they build while the scene loads.
         loaded = rendering.load_scene(scene, definitions)
         with progress("Rendering") as report:
-            bitmap = rendering.render(loaded, spp, seed, report)
+            bitmap = rendering.render(loaded, spp, seed, report, denoise)
         rendering.save(bitmap, unfinished)
     click.echo(path)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from .denoising import denoised, guided
 
 FORMATS = (".exr", ".png")
 
@@ -105,6 +107,7 @@ def render(
     spp: int | None = None,
     seed: int = 0,
     report: Callable[[float], None] = lambda fraction: None,
+    denoise: bool = False,
 ) -> mi.Bitmap:
     """Render the first sensor of ``scene`` and return its developed film.
 
@@ -115,9 +118,12 @@ def render(
     Args:
         spp: samples per pixel; None for what the scene says. Mitsuba rounds it up where the
             sampler requires it.
+        denoise: filter indirect light, see :mod:`glintbsdf.denoising`.
 
     Raises:
-        ValueError: no sensor, or a mesh without the UVs that its BSDF needs.
+        ValueError: no sensor, or a mesh without the UVs that its BSDF needs; or ``denoise`` with
+            an integrator other than ``glint_path``.
+        ModuleNotFoundError: ``denoise``, and no denoiser is installed.
         KeyboardInterrupt: also where Mitsuba itself has caught the signal.
     """
     if not scene.sensors():
@@ -133,12 +139,13 @@ def render(
         passes = _pass_count(spp, int(np.prod(sensor.film().crop_size())))
 
     total: np.ndarray | float = 0.0
-    with footprints(scene, sensor, spp, passes):
+    integrators = guided(scene.integrator()) if denoise else nullcontext(scene.integrator())
+    with footprints(scene, sensor, spp, passes), integrators as integrator:
         for index in range(passes):
             # Seeds of neighbouring images must not share passes.
             pass_seed = mi.sample_tea_32(seed, index)[0] if passes > 1 else seed
-            scene.integrator().render(scene, sensor, seed=pass_seed, spp=spp // passes)
-            if scene.integrator().should_stop():
+            integrator.render(scene, sensor, seed=pass_seed, spp=spp // passes)
+            if integrator.should_stop():
                 # Mitsuba caught Ctrl-C during the pass, and Python was not told.
                 raise KeyboardInterrupt
             bitmap = sensor.film().bitmap()
@@ -146,7 +153,7 @@ def render(
             report((index + 1) / passes)
     sampler.set_sample_count(spp)  # which the last pass has left at its own
     np.asarray(bitmap)[...] = total / passes
-    return bitmap
+    return denoised(bitmap) if denoise else bitmap
 
 
 def _pass_count(spp: int, pixels: int) -> int:

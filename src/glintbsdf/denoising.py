@@ -1,0 +1,78 @@
+"""Denoising of indirect light alone: glints, which are direct light, are never smoothed away.
+
+The integrator :mod:`glint_path <glintbsdf.plugins.glint_path>` separates the two. Indirect light is
+smooth but noisy (Tan et al. 2022, section 4), and Intel Open Image Denoise, through the package
+``mitsuba-oidn``, filters it with the albedo and the normals of the visible surfaces as guides, which
+Mitsuba's integrator ``aov`` renders along with the image.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mitsuba as mi
+import numpy as np
+
+#: Names of the images that the integrator of :func:`guided` renders.
+NAME, ALBEDO, NORMAL = "glints", "albedo", "normal"
+
+
+@contextmanager
+def guided(integrator: mi.Integrator) -> Iterator[mi.Integrator]:
+    """In the block, an integrator that renders as ``integrator`` does, with direct and indirect
+    light apart and the guides along with them.
+
+    Raises:
+        ValueError: ``integrator`` is not a ``glint_path``.
+        ModuleNotFoundError: there is no denoiser; the message has the command that helps.
+    """
+    if not hasattr(integrator, "separate"):
+        raise ValueError(
+            'denoising needs the integrator "glint_path", which tells indirect light from direct '
+            f"light (got {integrator.class_name()})"
+        )
+    if importlib.util.find_spec("mitsuba_oidn") is None:
+        raise ModuleNotFoundError(
+            "denoising needs Intel Open Image Denoise; install it with: "
+            f"{sys.executable} -m pip install mitsuba-oidn"
+        )
+    before, integrator.separate = integrator.separate, True
+    try:
+        aovs = f"{ALBEDO}:albedo,{NORMAL}:sh_normal"
+        yield mi.load_dict({"type": "aov", "aovs": aovs, NAME: integrator})
+    finally:
+        integrator.separate = before
+
+
+def denoised(bitmap: mi.Bitmap) -> mi.Bitmap:
+    """The image that the integrator of :func:`guided` has rendered, its indirect light denoised.
+
+    Red, green and blue are those of the direct light, unchanged, plus the denoised indirect light;
+    there is an alpha channel if ``bitmap`` has one.
+    """
+    layers = {name: np.array(layer, np.float32) for name, layer in bitmap.split()}
+    direct, indirect = (layers[f"{NAME}.{part}"] for part in ("direct", "indirect"))
+    pixels = direct + denoise(indirect, layers[ALBEDO], layers[NORMAL])
+    root = layers["<root>"]
+    if root.shape[-1] == 4:
+        pixels = np.concatenate([pixels, root[..., 3:]], axis=-1)
+    return mi.Bitmap(pixels)
+
+
+def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Filter an image.
+
+    Args:
+        radiance: (H, W, 3) float32, linear, of any range; what is negative counts as zero.
+        albedo: (H, W, 3) float32 in [0, 1].
+        normal: (H, W, 3) float32, shading normals in [-1, 1].
+
+    Returns:
+        (H, W, 3) float32. The mean is kept within the few per cent that outliers make.
+    """
+    import mitsuba_oidn  # costs a fraction of a second, and is not always installed
+
+    return np.asarray(mitsuba_oidn.denoise(radiance, albedo=albedo, normal=normal, hdr=True))
