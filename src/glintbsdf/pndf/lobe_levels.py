@@ -1,0 +1,405 @@
+"""MIP levels of 4D lobes for a synthesised map (NumPy).
+
+Tan et al., "Real-Time Microstructure Rendering with MIP-mapped Normal Map Samples" (2022), section
+5.1.2. A lobe is a Gaussian in position × normal space: a mass, a mean and a 4×4 covariance of
+(x, y, n_x, n_y). The lobes of a texel's grid cell are gathered to k clusters, each of which becomes
+one lobe with the mass, mean and covariance of its members.
+
+* *Texels*: one lobe per texel of the sample.
+* *Inside patches*: every patch in use is divided into n×n grids, n = 2, 4, …, as far as no overlap
+  can reach; each grid has k lobes. All cells of the map that show a patch share them.
+* *Overlaps*: what is left of each cell of the map, where cuts decide what is seen, has k lobes of
+  its own, in the order of the grids in which they lie.
+* *Cells*: k lobes for each cell of the map, for each 2×2 cells, and so on to one grid for all.
+
+So a cut is exact on all levels, and a footprint across patches needs no special treatment: the
+paper splits it into four, and falls back to unclustered lobes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from ..gaussian_lobes import SIGMA_H
+from ..progress import progress
+from ..synthesis import Synthesis, jacobians
+
+#: Smallest grid, texels: clusters of grids much smaller would hold one or two texels each.
+SMALLEST_GRID = 12
+
+#: Iterations of k-means.
+ITERATIONS = 8
+
+#: Of what :func:`build` returns; part of the cache's key.
+VERSION = 1
+
+
+@dataclass
+class Lobes:
+    """Gaussians in (x, y, n_x, n_y): ``mass`` N, ``mean`` N×4, ``covariance`` N×4×4 (float64)."""
+
+    mass: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.mass)
+
+    def __getitem__(self, index) -> Lobes:
+        return Lobes(self.mass[index], self.mean[index], self.covariance[index])
+
+    def moved(self, offset: np.ndarray) -> Lobes:
+        """The lobes, ``offset`` (N×2 or 2, texels) further on."""
+        mean = self.mean.copy()
+        mean[:, :2] += offset
+        return Lobes(self.mass, mean, self.covariance)
+
+    @staticmethod
+    def concatenate(parts: list[Lobes]) -> Lobes:
+        return Lobes(
+            *(
+                np.concatenate([getattr(p, name) for p in parts])
+                for name in ("mass", "mean", "covariance")
+            )
+        )
+
+
+def texel_lobes(normals: np.ndarray) -> Lobes:
+    """The lobe of every texel of a map (Eq. 4, 5), at its centre in the first texel: H·W lobes.
+
+    S = σ_h² I, the cross-covariance J S, and J S Jᵀ for the normals; the intrinsic roughness σ_r is
+    left to evaluation.
+    """
+    jacobian = jacobians(normals.astype(np.float64)).reshape(-1, 2, 2)
+    count = len(jacobian)
+    mean = np.concatenate((np.full((count, 2), 0.5), normals.reshape(-1, 2)), axis=1)
+    spread = np.concatenate((np.broadcast_to(np.eye(2), (count, 2, 2)), jacobian), axis=1)
+    covariance = SIGMA_H**2 * spread @ spread.transpose(0, 2, 1)
+    return Lobes(np.ones(count), mean, covariance)
+
+
+def merged(lobes: Lobes, label: np.ndarray, count: int) -> Lobes:
+    """One lobe for each of ``count`` labels, with the mass, mean and covariance of its members.
+
+    Exact moments: the covariance is the mean of the members' plus that of their means. A label
+    without members gives a lobe of no mass.
+    """
+
+    def total(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        sums = [np.bincount(label, column, count) for column in flat.T]
+        return np.stack(sums, axis=-1).reshape(count, *values.shape[1:])
+
+    mass = np.bincount(label, lobes.mass, count)
+    share = lobes.mass / mass[label]
+    mean = total(share[:, None] * lobes.mean)
+    offset = lobes.mean - mean[label]
+    second = lobes.covariance + offset[:, :, None] * offset[:, None, :]
+    return Lobes(mass, mean, total(share[:, None, None] * second))
+
+
+class Clustering:
+    """K-means over position and normal (section 5.1.2).
+
+    Distances are measured with positions in units of the standard deviation of a uniform grid,
+    side/√12, and normals in units of the sample's own standard deviation (root mean square of x and
+    y), times ``normal_weight``.
+    """
+
+    def __init__(self, clusters: int, normals: np.ndarray, normal_weight: float, seed: int) -> None:
+        self.clusters = clusters
+        deviation = float(np.sqrt(normals.reshape(-1, 2).var(axis=0).mean()))
+        # In a sample without any variation, position alone counts.
+        self.normal_scale = normal_weight / deviation if deviation > 0 else 0.0
+        self.rng = np.random.default_rng(seed)
+
+    def gather(self, lobes: Lobes, group: np.ndarray, groups: int, side: float) -> Lobes:
+        """Gather the lobes of every group to ``clusters`` ones, stored group after group.
+
+        ``group``: of every lobe, ascending. Groups with fewer lobes are filled up with lobes of no
+        mass.
+        """
+        k = self.clusters
+        scale = np.array([np.sqrt(12) / side] * 2 + [self.normal_scale] * 2)
+        features = lobes.mean * scale
+        borders = np.searchsorted(group, np.arange(groups + 1))
+        label = np.empty(len(lobes), np.int64)
+        with warnings.catch_warnings():  # a cluster that loses all members is no harm
+            warnings.filterwarnings("ignore", message="One of the clusters is empty")
+            for g, (first, last) in enumerate(zip(borders[:-1], borders[1:], strict=True)):
+                label[first:last] = g * k + self._labels(features[first:last])
+        return merged(lobes, label, groups * k)
+
+    def _labels(self, features: np.ndarray) -> np.ndarray:
+        count = len(features)
+        if count <= self.clusters:
+            return np.arange(count)
+        begin = features[self.rng.choice(count, self.clusters, replace=False)]
+        return kmeans2(features, begin, iter=ITERATIONS, minit="matrix")[1]
+
+
+def morton(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Index of a grid in Morton order: those of a coarser division lie side by side."""
+    result = np.zeros_like(y)
+    for bit in range(int(max(y.max(initial=0), x.max(initial=0))).bit_length()):
+        result |= ((y >> bit & 1) << (2 * bit + 1)) | ((x >> bit & 1) << (2 * bit))
+    return result
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How cells are divided and levels follow each other.
+
+    Attributes:
+        divisions: n of the levels inside patches, finest first; a power of two each.
+        inner: side of the smallest cell, texels: grids are ``inner / n`` wide, the last one of a
+            larger cell more.
+        cells: number of grids along an axis of the levels from one cell per grid on.
+    """
+
+    divisions: tuple[int, ...]
+    inner: int
+    cells: tuple[int, ...]
+
+    @classmethod
+    def of(cls, synthesis: Synthesis) -> Layout:
+        inner = int(np.diff(synthesis.starts).min())
+        divisions = []
+        while inner / 2 ** (len(divisions) + 1) >= SMALLEST_GRID:
+            divisions.insert(0, 2 ** (len(divisions) + 1))
+        cells = [len(synthesis.patch)]
+        while cells[-1] > 1:
+            cells.append(-(-cells[-1] // 2))
+        return cls(tuple(divisions), inner, tuple(cells))
+
+    def grid(self, position: np.ndarray, n: int) -> np.ndarray:
+        """Grid along an axis that holds a position in a cell, of ``n``."""
+        return np.clip((position * (n / self.inner)).astype(np.int64), 0, n - 1)
+
+
+def build(
+    synthesis: Synthesis, clusters: int, normal_weight: float, seed: int
+) -> dict[str, np.ndarray]:
+    """All levels of lobes of a synthesised map.
+
+    Returns:
+        ``texels``: packed lobes of the sample's texels; ``inside``: those inside patches, patch by
+        patch, division by division, row by row of the grids; ``overlaps``: those of the cells'
+        overlaps; ``segments``, (n² + 1) per cell: where in them each grid of the finest division
+        begins, in Morton order; ``cells``: those of cells and groups of cells, level by level.
+        Unless there are divisions, ``inside``, ``overlaps`` and ``segments`` are empty.
+    """
+    layout = Layout.of(synthesis)
+    clustering = Clustering(clusters, synthesis.normals, normal_weight, seed)
+    texels = texel_lobes(synthesis.normals)
+    steps = len(layout.divisions) + 1 + len(layout.cells)
+    with progress("Clustering lobes") as report:
+        inside, finest = _inside_patches(synthesis, layout, clustering, texels)
+        report(len(layout.divisions) / steps)
+        overlaps, segments, cells = _cells(synthesis, layout, clustering, texels, finest)
+        report((len(layout.divisions) + 2) / steps)
+        levels = [cells]
+        for done, level in enumerate(_groups_of_cells(synthesis, layout, clustering, cells)):
+            levels.append(level)
+            report((len(layout.divisions) + 3 + done) / steps)
+    step = float(np.diff(synthesis.starts).max())
+    return {
+        "texels": pack(texels, 1.0),
+        "inside": pack(inside, step),
+        "overlaps": pack(overlaps, step),
+        "segments": segments,
+        "cells": np.concatenate([pack(level, step * 2**j) for j, level in enumerate(levels)]),
+    }
+
+
+def all_words(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """The packed lobes that :func:`build` returns in one flat array, kind after kind."""
+    kinds = ("texels", "inside", "overlaps", "cells")
+    return np.concatenate([arrays[kind].ravel() for kind in kinds])
+
+
+def _inside_patches(synthesis, layout, clustering, texels) -> tuple[Lobes, Lobes | None]:
+    """Lobes inside patches, positions from the patch's corner, and those of the coarsest division
+    (None where there is no division)."""
+    patches = len(synthesis.origins)
+    levels, members = [], None
+    for n in layout.divisions:
+        if members is None:
+            inner = np.arange(synthesis.overlap, layout.inner)
+            y, x = (v.ravel() for v in np.meshgrid(inner, inner, indexing="ij"))
+            members = _texels_at(synthesis, texels, synthesis.origins, y, x)
+            patch = np.repeat(np.arange(patches), len(y))
+        grid = [layout.grid(members.mean[:, axis], n) for axis in (1, 0)]
+        group = (patch * n + grid[0]) * n + grid[1]
+        order = np.argsort(group, kind="stable")
+        members = clustering.gather(members[order], group[order], patches * n * n, layout.inner / n)
+        levels.append(members)
+        patch = np.repeat(np.arange(patches), n * n * clustering.clusters)
+        real = members.mass > 0
+        members, patch = members[real], patch[real]
+    if not levels:
+        return _none(), None
+    by_patch = [
+        np.arange(len(level)).reshape(patches, -1) + sum(len(v) for v in levels[:i])
+        for i, level in enumerate(levels)
+    ]
+    return Lobes.concatenate(levels)[np.concatenate(by_patch, axis=1).ravel()], levels[-1]
+
+
+def _texels_at(synthesis, texels, origins, y, x) -> Lobes:
+    """Lobes of the texels (y, x) of all patches, positions from the patch's corner."""
+    width = synthesis.normals.shape[1]
+    source = (origins[:, :1] + y) * width + origins[:, 1:] + x
+    place = np.stack((x, y), axis=1)
+    return texels[source.ravel()].moved(np.tile(place, (len(origins), 1)))
+
+
+def _cells(synthesis, layout, clustering, texels, finest):
+    """Lobes of the cells' overlaps with their segments, and lobes of whole cells."""
+    count = len(synthesis.patch)
+    n = layout.divisions[0] if layout.divisions else 1
+    overlaps, segments, cells = [], [], []
+    first = 0
+    for y in range(count):
+        row = _cell_row(synthesis, layout, texels, y, whole=finest is None)
+        lobes, cell = row
+        if finest is None:
+            cells.append(clustering.gather(lobes, cell, count, layout.inner))
+            continue
+        lobes = clustering.gather(lobes, cell, count, layout.inner)
+        cell = np.repeat(np.arange(count), clustering.clusters)
+        grid = morton(*(layout.grid(lobes.mean[:, axis], n) for axis in (1, 0)))
+        # Lobes of no mass come last, behind all grids
+        key = cell * (n * n + 1) + np.where(lobes.mass > 0, grid, n * n)
+        order = np.argsort(key, kind="stable")
+        lobes = lobes[order]
+        overlaps.append(lobes)
+        segments.append(first + np.searchsorted(key[order], np.arange(count * (n * n + 1))))
+        first += len(lobes)
+
+        per_patch = len(finest) // len(synthesis.origins)
+        index = synthesis.patch[y][:, None] * per_patch + np.arange(per_patch)
+        inside = finest[index.ravel()]
+        both = Lobes.concatenate([lobes, inside])
+        cell = np.concatenate((cell, np.repeat(np.arange(count), per_patch)))
+        cells.append(_gather_real(clustering, both, cell, count, layout.inner))
+    if finest is None:
+        return _none(), np.empty(0, np.uint32), Lobes.concatenate(cells)
+    return (
+        Lobes.concatenate(overlaps),
+        np.concatenate(segments).astype(np.uint32),
+        Lobes.concatenate(cells),
+    )
+
+
+def _cell_row(synthesis, layout, texels, row: int, whole: bool) -> tuple[Lobes, np.ndarray]:
+    """Lobes of the texels of a row of cells, whole or those of overlaps only, and their cells."""
+    rows = np.arange(synthesis.starts[row], synthesis.starts[row + 1])
+    y, x = (v.ravel() for v in np.meshgrid(rows, np.arange(synthesis.size), indexing="ij"))
+    cell = synthesis.cell_of[x]
+    local = np.stack((x - synthesis.starts[cell], y - rows[0]), axis=1)
+    if not whole:
+        outside = ((local < synthesis.overlap) | (local >= layout.inner)).any(axis=1)
+        y, x, cell, local = (v[outside] for v in (y, x, cell, local))
+    order = np.argsort(cell, kind="stable")
+    y, x, cell, local = (v[order] for v in (y, x, cell, local))
+    return texels[synthesis.source(y, x)].moved(local), cell
+
+
+def _gather_real(clustering, lobes, group, groups, side) -> Lobes:
+    """Gather lobes in any order, leaving out those of no mass."""
+    real = np.flatnonzero(lobes.mass > 0)
+    order = real[np.argsort(group[real], kind="stable")]
+    return clustering.gather(lobes[order], group[order], groups, side)
+
+
+def _groups_of_cells(synthesis, layout, clustering, members) -> Iterator[Lobes]:
+    """Lobes of 2×2 cells, of 4×4 and so on, positions from the group's first texel."""
+    starts = synthesis.starts
+    for level, (finer, coarser) in enumerate(zip(layout.cells, layout.cells[1:], strict=False)):
+        cell = np.repeat(np.arange(finer * finer), clustering.clusters)
+        y, x = divmod(cell, finer)
+        origin, group_origin = (
+            np.stack([starts[(v >> up) << (level + up)] for v in (x, y)], axis=1) for up in (0, 1)
+        )
+        members = _gather_real(
+            clustering,
+            members.moved(origin - group_origin),
+            (y >> 1) * coarser + (x >> 1),
+            coarser * coarser,
+            layout.inner * 2 ** (level + 1),
+        )
+        yield members
+
+
+def _none() -> Lobes:
+    return Lobes(np.empty(0), np.empty((0, 4)), np.empty((0, 4, 4)))
+
+
+# ------------------------------------------------------------------------------------------------
+#  Packing
+# ------------------------------------------------------------------------------------------------
+
+
+def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """L, B and Q of lobes, N×2×2 each: S = L Lᵀ, cross-covariance B Lᵀ, normals B Bᵀ + Q Qᵀ.
+
+    L and Q are lower triangular. Q Qᵀ is what the normals vary when the position is known, a Schur
+    complement, which rounding may leave just below zero: its roots are then 0.
+    """
+    root = np.linalg.cholesky(covariance[:, :2, :2])
+    cross = np.linalg.solve(root, covariance[:, :2, 2:]).transpose(0, 2, 1)
+    rest = covariance[:, 2:, 2:] - cross @ cross.transpose(0, 2, 1)
+    q = np.zeros_like(rest)
+    q[:, 0, 0] = np.sqrt(np.maximum(rest[:, 0, 0], 0))
+    positive = q[:, 0, 0] > 0
+    q[:, 1, 0] = np.where(positive, rest[:, 1, 0] / np.where(positive, q[:, 0, 0], 1), 0)
+    q[:, 1, 1] = np.sqrt(np.maximum(rest[:, 1, 1] - q[:, 1, 0] ** 2, 0))
+    return root, cross, q
+
+
+def pack(lobes: Lobes, extent: float) -> np.ndarray:
+    """Lobes in 32 bytes each: N×8 words of two 16-bit numbers, the lower one first.
+
+    ====  =============================================================
+    0     mean position (x, y), 65535 for ``extent`` texels
+    1     mass / extent² and L_xx, as all that follow in half precision
+    2     L_yx, L_yy
+    3     √ trace(B Bᵀ + Q Qᵀ), the spread of the normals, and Q_xx
+    4     mean normal (x, y), 65535 for the range from −1 to 1
+    5     Q_yx, Q_yy
+    6, 7  B_xx, B_xy; B_yx, B_yy
+    ====  =============================================================
+
+    L, B and Q as in :func:`factors`, texels and units of projected normals.
+    """
+    real = lobes.mass > 0
+    covariance = np.where(real[:, None, None], lobes.covariance, np.eye(4))
+    root, cross, q = factors(covariance)
+    spread = np.sqrt(np.trace(covariance[:, 2:, 2:], axis1=1, axis2=2))
+
+    def fixed(value: np.ndarray) -> np.ndarray:
+        return np.round(65535 * np.clip(value, 0, 1)).astype(np.uint16)
+
+    def half(value: np.ndarray) -> np.ndarray:
+        return value.astype(np.float16).view(np.uint16)
+
+    x, y = (fixed(lobes.mean[:, axis] / extent) for axis in (0, 1))
+    n_x, n_y = (fixed(0.5 + 0.5 * lobes.mean[:, axis]) for axis in (2, 3))
+    numbers = (
+        (x, y),
+        (half(lobes.mass / extent**2), half(root[:, 0, 0])),
+        (half(root[:, 1, 0]), half(root[:, 1, 1])),
+        (half(spread), half(q[:, 0, 0])),
+        (n_x, n_y),
+        (half(q[:, 1, 0]), half(q[:, 1, 1])),
+        (half(cross[:, 0, 0]), half(cross[:, 0, 1])),
+        (half(cross[:, 1, 0]), half(cross[:, 1, 1])),
+    )
+    words = [low.astype(np.uint32) | (high.astype(np.uint32) << 16) for low, high in numbers]
+    return np.stack(words, axis=1)

@@ -1,0 +1,452 @@
+"""A large normal map put together from patches of a small sample, without storing it.
+
+Tan, Zhu, Xu, Meng, Wang and Yan, "Real-Time Microstructure Rendering with MIP-mapped Normal Map
+Samples" (2022), section 5.1.1, which follows the image quilting of Efros and Freeman (2001). What
+is put together are the lobes of the sample's texels: a normal each, and its Jacobian. The large map
+is divided into cells; each cell shows a patch of the sample, which reaches into the next cells by
+the overlap. There, a cut of least error (Eq. 7) decides which of the patches each texel belongs to.
+
+The map itself never exists: it follows from the patch of every cell and, for the texels of the
+overlaps, from whose patch they belong to. Arrays are indexed (row, column), in texels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, sqrt
+from pathlib import Path
+
+import numpy as np
+
+from .errors import check
+from .normalmap import NormalMap
+from .progress import progress
+
+#: Patches to choose from, in sample areas: each texel of the sample is in so many of them.
+REUSE = 24
+
+#: What the owner of a texel in an overlap is called: the cell before in x, in y, or both.
+BEFORE_X, BEFORE_Y = 1, 2
+
+
+def jacobians(normals: np.ndarray) -> np.ndarray:
+    """∂n/∂u of every texel, per texel: H×W×2×2, the last axis being (x, y) of the position.
+
+    Central differences, one-sided at the border: what lies beyond it is not part of the sample.
+    A sample one texel wide varies along the other axis only.
+    """
+    along = [
+        np.gradient(normals, axis=axis) if normals.shape[axis] > 1 else np.zeros_like(normals)
+        for axis in (1, 0)
+    ]
+    return np.stack(along, axis=-1)
+
+
+def lobe_features(normals: np.ndarray, balance: float) -> np.ndarray:
+    """Vectors whose squared distance is Eq. 7, ``α |n_i − n_j|² + (1 − α) |J_i − J_j|²``: H×W×6."""
+    gradients = jacobians(normals).reshape(*normals.shape[:2], 4)
+    return np.concatenate((sqrt(balance) * normals, sqrt(1 - balance) * gradients), axis=2)
+
+
+def minimum_error_cut(error: np.ndarray) -> np.ndarray:
+    """The connected path of least total error down a strip, by dynamic programming.
+
+    Args:
+        error: N×L×W, the error of N strips, L texels long and W wide.
+
+    Returns:
+        N×L, the place of the path across the strip, in [0, W), which moves by at most one texel
+        from each row to the next.
+    """
+    count, length, width = error.shape
+    steps = np.empty((length, count, width), np.int8)
+    total = error[:, 0]
+    around = np.full((3, count, width), np.inf)  # straight on where it makes no difference
+    for k in range(1, length):
+        around[0], around[1, :, 1:], around[2, :, :-1] = total, total[:, :-1], total[:, 1:]
+        steps[k] = np.array((0, -1, 1), np.int8)[around.argmin(axis=0)]
+        total = error[:, k] + around.min(axis=0)
+    path = np.empty((count, length), np.int64)
+    path[:, -1] = total.argmin(axis=1)
+    for k in range(length - 1, 0, -1):
+        path[:, k - 1] = path[:, k] + steps[k][np.arange(count), path[:, k]]
+    return path
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """The look-up table: which texel of the sample each texel of the large map shows.
+
+    Attributes:
+        normals: h×w×2, projected normals of the sample, float32.
+        size: texels of the map along each axis.
+        overlap: texels by which patches reach into the next cells.
+        toroidal: whether the map fits to itself when it is repeated.
+        origins: P×2, places in the sample of the patches in use.
+        patch: n×n, the patch of each cell.
+        owners: n×n×L, for the texels of a cell's overlaps, whose patch they belong to: 0 for the
+            cell's own, or the sum of :data:`BEFORE_X` and :data:`BEFORE_Y`. The texels are the
+            first ``overlap`` rows of the cell, then the first columns of its other rows; L is
+            that of the largest cell.
+        best_only: number of cells for which no patch was within the tolerance, so that the best
+            was taken.
+    """
+
+    normals: np.ndarray
+    size: int
+    overlap: int
+    toroidal: bool
+    origins: np.ndarray
+    patch: np.ndarray
+    owners: np.ndarray
+    best_only: int
+
+    @classmethod
+    def from_arrays(cls, normals, size: int, overlap: int, arrays) -> Synthesis:
+        """The table again from :meth:`arrays`, for the same sample."""
+        toroidal, best_only = (int(v) for v in arrays["numbers"])
+        tables = (arrays[name] for name in ("origins", "patch", "owners"))
+        return cls(normals, size, overlap, bool(toroidal), *tables, best_only)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What to keep of the table, besides the sample, size and overlap."""
+        return {
+            "origins": self.origins,
+            "patch": self.patch,
+            "owners": self.owners,
+            "numbers": np.array([self.toroidal, self.best_only]),
+        }
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Borders of the cells along an axis, n + 1 texel indices."""
+        return cell_borders(self.size, len(self.patch))
+
+    @cached_property
+    def cell_of(self) -> np.ndarray:
+        """Index along an axis of the cell that holds each texel row or column."""
+        return np.repeat(np.arange(len(self.patch)), np.diff(self.starts))
+
+    def source(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """Index (row · w + column) of the sample's texel that the map shows, for indices alike."""
+        cell_y, cell_x = self.cell_of[row], self.cell_of[column]
+        y, x = row - self.starts[cell_y], column - self.starts[cell_x]
+        step = self.starts[cell_x + 1] - self.starts[cell_x]
+        place = overlap_index(y, x, step, self.overlap)
+        owner = np.where(place >= 0, self.owners[cell_y, cell_x, place], 0)
+        cell_y, y = self._owner_axis(cell_y, y, owner & BEFORE_Y)
+        cell_x, x = self._owner_axis(cell_x, x, owner & BEFORE_X)
+        origin = self.origins[self.patch[cell_y, cell_x]]
+        return (origin[..., 0] + y) * self.normals.shape[1] + origin[..., 1] + x
+
+    def _owner_axis(self, cell, offset, before):
+        """Cell of the owner, and the offset from its start, along one axis."""
+        owner = np.where(before, (cell - 1) % len(self.patch), cell)
+        step = self.starts[owner + 1] - self.starts[owner]
+        return owner, np.where(before, offset + step, offset)
+
+    def explicit(self) -> np.ndarray:
+        """The whole map, size×size×2 projected normals: as large as what is saved by not storing
+        it."""
+        index = np.arange(self.size)
+        texels = self.normals.reshape(-1, 2)
+        result = np.empty((self.size, self.size, 2), np.float32)
+        for rows in np.array_split(index, len(self.patch)):
+            result[rows] = texels[self.source(*np.broadcast_arrays(rows[:, None], index))]
+        return result
+
+    def normal_map(self) -> NormalMap:
+        """The whole map, repeating where it was made to."""
+        return NormalMap(self.explicit(), "repeat" if self.toroidal else "mirror")
+
+    def write(self, filename: str | Path) -> None:
+        """Write the whole map to an OpenEXR file, channels R, G, B = (x, y, z), float32."""
+        import OpenEXR
+
+        normals = self.explicit()
+        z = np.sqrt(1 - np.einsum("ijk,ijk->ij", normals, normals, dtype=np.float64))
+        channels = {"RGB": np.dstack((normals, z.astype(np.float32)))}
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels) as file:
+            file.write(str(filename))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the table, bytes, with the owners packed to two bits each."""
+        return self.origins.size * 4 + self.patch.size * 4 + self.owners.size // 4
+
+    def __str__(self) -> str:
+        height, width, _ = self.normals.shape
+        return (
+            f"{width}×{height} texels made {self.size}×{self.size} by {self.patch.size} cells "
+            f"with {len(self.origins)} patches; in {self.best_only} cells "
+            f"({self.best_only / self.patch.size:.0%}) no patch was within the tolerance, and the "
+            "best was taken"
+        )
+
+
+def cell_borders(size: int, count: int) -> np.ndarray:
+    """Borders of ``count`` cells as equal as whole texels allow: ``count + 1`` indices."""
+    return np.arange(count + 1) * size // count
+
+
+def overlap_index(y, x, step_x, overlap: int):
+    """Place of a cell's texel in the cell's list of overlap texels, or −1 inside.
+
+    ``y``, ``x``: from the cell's first texel; ``step_x``: the cell's width. See
+    :attr:`Synthesis.owners`.
+    """
+    beside = np.where(x < overlap, overlap * step_x + (y - overlap) * overlap + x, -1)
+    return np.where(y < overlap, y * step_x + x, beside)
+
+
+def check_sizes(
+    sample: tuple[int, int], output_size: int, patch_size: int, overlap: int, owner: str
+) -> None:
+    """Raise :class:`~glintbsdf.errors.ParameterError` unless patches of that size fit."""
+    check(
+        1 <= patch_size < min(sample),
+        owner,
+        "patch_size",
+        f"at least 1 and smaller than the sample of {sample[1]} x {sample[0]} texels",
+        patch_size,
+    )
+    check(
+        1 <= overlap < patch_size / 2,
+        owner,
+        "overlap",
+        f"at least 1 and smaller than half a patch of {patch_size} texels",
+        overlap,
+    )
+    check(
+        patch_size < output_size <= 1 << 16,
+        owner,
+        "output_size",
+        f"larger than a patch of {patch_size} texels and at most {1 << 16}",
+        output_size,
+    )
+
+
+def synthesise(
+    sample: NormalMap,
+    output_size: int = 4096,
+    patch_size: int = 64,
+    overlap: int = 2,
+    balance: float = 0.9,
+    tolerance: float = 1.0,
+    toroidal: bool = True,
+    seed: int = 0,
+    owner: str = "synthesise",
+) -> Synthesis:
+    """Make a large map from patches of a sample (section 5.1.1, steps 1 to 6).
+
+    Patches are chosen from :data:`REUSE` × sample area / patch area places in the sample, drawn at
+    random, or from all places where there are fewer: structures built per patch, such as those of
+    :class:`~glintbsdf.pndf.Mip`, then stay small whatever the output's size.
+
+    Args:
+        sample: the small map.
+        output_size: texels of the large map along each axis, larger than a patch.
+        patch_size: texels of a patch along each axis, fewer than the sample's.
+        overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2.
+        balance: α of Eq. 7, in [0, 1]: 1 compares normals alone, 0 their Jacobians.
+        tolerance: patches are chosen at random among those whose mean error over the overlap is at
+            most this multiple of the mean error between neighbouring texels of the sample; where
+            there is none, the best is taken.
+        toroidal: make the map's opposite edges fit.
+        seed: another one gives another map, in [0, 2⁶³).
+        owner: whom errors name.
+
+    Raises :class:`~glintbsdf.errors.ParameterError`.
+    """
+    check_sizes((sample.height, sample.width), output_size, patch_size, overlap, owner)
+    check(0 <= balance <= 1, owner, "balance", "a number in [0, 1]", balance)
+    check(0 <= tolerance < np.inf, owner, "tolerance", "a finite number ≥ 0", tolerance)
+    check(isinstance(seed, int) and 0 <= seed < 1 << 63, owner, "seed", "an integer ≥ 0", seed)
+    quilt = _Quilt(sample.normals, output_size, patch_size, overlap, balance, toroidal, seed)
+    fronts = quilt.fronts()
+    with progress("Synthesising the map") as report:
+        for done, cells in enumerate(fronts):
+            quilt.place(cells, tolerance)
+            report((done + 1) / len(fronts))
+    return quilt.result()
+
+
+class _Quilt:
+    """A map in the making: cells are filled front by front, none of whose cells touch."""
+
+    def __init__(self, normals, size, patch_size, overlap, balance, toroidal, seed) -> None:
+        self.normals, self.size, self.overlap, self.toroidal = normals, size, overlap, toroidal
+        self.count = ceil(size / (patch_size - overlap))
+        self.starts = cell_borders(size, self.count)
+        self.steps = np.diff(self.starts)
+        # Patches are cut to what the largest cell needs.
+        self.side = int(self.steps.max()) + overlap
+
+        rng = np.random.default_rng(seed)
+        places = (normals.shape[0] - self.side + 1, normals.shape[1] - self.side + 1)
+        total = places[0] * places[1]
+        wanted = ceil(REUSE * normals.shape[0] * normals.shape[1] / patch_size**2)
+        chosen = rng.choice(total, min(total, wanted), replace=False)
+        self.origins = np.stack(np.unravel_index(np.sort(chosen), places), axis=1)
+        self.random = rng.random((self.count, self.count))
+
+        self.features = lobe_features(normals, balance).astype(np.float32)
+        inside = [np.diff(self.features, axis=axis) for axis in (0, 1)]
+        self.inside_error = np.mean([np.mean((d**2).sum(axis=2)) for d in inside])
+
+        self.patch = np.full((self.count, self.count), -1)
+        self.owner = np.zeros((size, size), np.uint8)
+        self.best_only = 0
+        # Features of the first rows and columns of all patches, and of the last where they count.
+        begin, end, every = slice(overlap), slice(int(self.steps[-1]), self.side), slice(None)
+        strips = {"top": (begin, every), "left": (every, begin)}
+        if toroidal:
+            end = slice(end.start, end.start + overlap)
+            strips |= {"bottom": (end, every), "right": (every, end)}
+        self.strips = {name: _Strip(self, *part) for name, part in strips.items()}
+
+    def fronts(self) -> list[np.ndarray]:
+        """Cells in an order in which those above, to the left and above right come first.
+
+        Those of one front, all with the same 2y + x, do not depend on each other, unless there are
+        so few that a row's last cell touches the next row's first.
+        """
+        y, x = np.indices((self.count, self.count)).reshape(2, -1)
+        key = 2 * y + x if self.count > 3 else y * self.count + x
+        return [np.stack((y, x), axis=1)[key == k] for k in np.unique(key)]
+
+    def place(self, cells: np.ndarray, tolerance: float) -> None:
+        """Steps 3 to 5: choose patches for some cells, cut them to fit, and put them in place."""
+        y, x = cells.T
+        rows, columns = (self.starts[v, None] + np.arange(self.side) for v in (y, x))
+        last = self.count - 1
+        fits_to = {
+            "top": y > 0,
+            "left": x > 0,
+            "bottom": self.toroidal & (y == last),
+            "right": self.toroidal & (x == last),
+        }
+        # A cell may be a texel smaller than the patch allows for: what is beyond is not placed.
+        in_rows = np.arange(self.side) < self.steps[y, None] + self.overlap
+        in_columns = np.arange(self.side) < self.steps[x, None] + self.overlap
+        if not self.toroidal:
+            in_rows &= rows < self.size
+            in_columns &= columns < self.size
+        rows, columns = rows % self.size, columns % self.size
+        window = in_rows[:, :, None] & in_columns[:, None, :]
+
+        overlaps = {}
+        counted = np.zeros_like(window)  # texels of corners count once
+        total = np.zeros((len(cells), len(self.origins)))
+        for name, strip in self.strips.items():
+            these = np.flatnonzero(fits_to[name])
+            if len(these):
+                part = (these, *strip.part)
+                source = self.source(
+                    rows[these, strip.part[0], None], columns[these, None, strip.part[1]]
+                )
+                there = self.features.reshape(-1, 6)[source]
+                overlaps[name] = these, there
+                weight = window[part] & ~counted[part]
+                counted[part] |= weight
+                total[these] += strip.total_errors(there, weight)
+        mean = total / np.maximum(counted.sum(axis=(1, 2)), 1)[:, None]
+
+        allowed = mean <= tolerance * self.inside_error
+        none = ~allowed.any(axis=1)
+        self.best_only += int(none.sum())
+        nth = (self.random[y, x] * allowed.sum(axis=1)).astype(int)
+        chosen = np.where(
+            none, mean.argmin(axis=1), (allowed.cumsum(axis=1) > nth[:, None]).argmax(axis=1)
+        )
+
+        mine = window.copy()
+        for name, (these, there) in overlaps.items():
+            part = (these, *self.strips[name].part)
+            error = np.where(window[part], self.strips[name].errors(there, chosen[these]), 0)
+            mine[part] &= _on_new_side(error, name)
+        self.patch[y, x] = chosen
+        code = (np.arange(self.side) >= self.steps[y, None])[:, :, None] * np.uint8(BEFORE_Y)
+        code = code + (np.arange(self.side) >= self.steps[x, None])[:, None, :] * np.uint8(BEFORE_X)
+        cell, i, j = np.nonzero(mine)
+        self.owner[rows[cell, i], columns[cell, j]] = code[cell, i, j]
+
+    def source(self, row, column) -> np.ndarray:
+        """Index of the sample's texel that a texel shows by now, anything where none is placed."""
+        row, column = np.broadcast_arrays(row, column)
+        owner = self.owner[row, column]
+        place = []
+        for index, before in ((row, BEFORE_Y), (column, BEFORE_X)):
+            cell = np.searchsorted(self.starts, index, side="right") - 1
+            owning = np.where(owner & before, (cell - 1) % self.count, cell)
+            place.append((owning, (index - self.starts[owning]) % self.size))
+        (cell_y, y), (cell_x, x) = place
+        origin = self.origins[self.patch[cell_y, cell_x]]
+        source = (origin[..., 0] + y) * self.normals.shape[1] + origin[..., 1] + x
+        return np.minimum(source, self.normals.shape[0] * self.normals.shape[1] - 1)
+
+    def result(self) -> Synthesis:
+        """The finished map, with the patches that are in use only."""
+        used, patch = np.unique(self.patch, return_inverse=True)
+        longest = int(self.steps.max())
+        owners = np.zeros((self.count, self.count, 2 * longest * self.overlap), np.uint8)
+        for y in range(self.count):
+            for x in range(self.count):
+                block = self.owner[
+                    self.starts[y] : self.starts[y + 1], self.starts[x] : self.starts[x + 1]
+                ]
+                strips = np.concatenate(
+                    (block[: self.overlap].ravel(), block[self.overlap :, : self.overlap].ravel())
+                )
+                owners[y, x, : len(strips)] = strips
+        return Synthesis(
+            self.normals,
+            self.size,
+            self.overlap,
+            self.toroidal,
+            self.origins[used].astype(np.int32),
+            patch.reshape(self.patch.shape).astype(np.int32),
+            owners,
+            self.best_only,
+        )
+
+
+class _Strip:
+    """A part of a patch's window that overlaps others, and the features of all patches there."""
+
+    def __init__(self, quilt: _Quilt, rows: slice, columns: slice) -> None:
+        self.part = rows, columns
+        y, x = (np.arange(quilt.side)[part] for part in self.part)
+        self.patches = quilt.features[
+            quilt.origins[:, 0, None, None] + y[:, None], quilt.origins[:, 1, None, None] + x
+        ]
+        self.squares = (self.patches**2).sum(axis=3).reshape(len(self.patches), -1)
+
+    def total_errors(self, there: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Sum of ``weight`` |there − patch|² for N windows and all patches: N×P.
+
+        ``there``: N × rows × columns × 6; ``weight``: N × rows × columns, whether a texel counts.
+        As matrix products: |a|² − 2 a·b + |b|².
+        """
+        weight = weight.astype(np.float32)
+        weighted = (there * weight[..., None]).reshape(len(there), -1)
+        own = (weighted * there.reshape(len(there), -1)).sum(axis=1, keepdims=True)
+        product = weighted @ self.patches.reshape(len(self.patches), -1).T
+        of_patches = weight.reshape(len(there), -1) @ self.squares.T
+        return np.maximum(own - 2 * product + of_patches, 0)
+
+    def errors(self, there: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """|there − patch|² of N windows, each with its ``chosen`` patch: N × rows × columns."""
+        return ((there - self.patches[chosen]) ** 2).sum(axis=3)
+
+
+def _on_new_side(error: np.ndarray, name: str) -> np.ndarray:
+    """Which texels of a strip lie on the new patch's side of the least cut, the cut included."""
+    across = 1 if name in ("top", "bottom") else 2
+    error = np.moveaxis(error, across, 2)
+    path = minimum_error_cut(error)[:, :, None]
+    place = np.arange(error.shape[2])
+    new = place >= path if name in ("top", "left") else place <= path
+    return np.moveaxis(new, 2, across)
