@@ -12,6 +12,7 @@ overlaps, from whose patch they belong to. Arrays are indexed (row, column), in 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, sqrt
@@ -201,31 +202,53 @@ def overlap_index(y, x, step_x, overlap: int):
     return np.where(y < overlap, y * step_x + x, beside)
 
 
+def check_whole(
+    value: object, fits: Callable[[int], bool], owner: str, parameter: str, requirement: str
+) -> None:
+    """Raise :class:`~glintbsdf.errors.ParameterError` unless ``value`` is a whole number that
+    ``fits``."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    check(whole and fits(value), owner, parameter, f"a whole number {requirement}", value)
+
+
 def check_sizes(
     sample: tuple[int, int], output_size: int, patch_size: int, overlap: int, owner: str
 ) -> None:
     """Raise :class:`~glintbsdf.errors.ParameterError` unless patches of that size fit."""
-    check(
-        1 <= patch_size < min(sample),
+    check_whole(
+        patch_size,
+        lambda size: 3 <= size < min(sample),
         owner,
         "patch_size",
-        f"at least 1 and smaller than the sample of {sample[1]} x {sample[0]} texels",
-        patch_size,
+        f"≥ 3 and smaller than the sample of {sample[1]} x {sample[0]} texels",
     )
-    check(
-        1 <= overlap < patch_size / 2,
+    check_whole(
+        overlap,
+        lambda size: 1 <= size < patch_size / 2,
         owner,
         "overlap",
-        f"at least 1 and smaller than half a patch of {patch_size} texels",
-        overlap,
+        f"≥ 1 and smaller than half a patch of {patch_size} texels",
     )
-    check(
-        patch_size < output_size <= 1 << 16,
+    check_whole(
+        output_size,
+        lambda size: patch_size < size <= 1 << 16,
         owner,
         "output_size",
         f"larger than a patch of {patch_size} texels and at most {1 << 16}",
-        output_size,
     )
+    cell = output_size // cell_count(output_size, patch_size, overlap)
+    check(
+        overlap < cell,
+        owner,
+        "overlap",
+        f"smaller than the {cell} texels of the cells that {output_size} texels are divided into",
+        overlap,
+    )
+
+
+def cell_count(output_size: int, patch_size: int, overlap: int) -> int:
+    """Cells along an axis: as few as patches can fill."""
+    return ceil(output_size / (patch_size - overlap))
 
 
 def synthesise(
@@ -263,7 +286,7 @@ def synthesise(
     check_sizes((sample.height, sample.width), output_size, patch_size, overlap, owner)
     check(0 <= balance <= 1, owner, "balance", "a number in [0, 1]", balance)
     check(0 <= tolerance < np.inf, owner, "tolerance", "a finite number ≥ 0", tolerance)
-    check(isinstance(seed, int) and 0 <= seed < 1 << 63, owner, "seed", "an integer ≥ 0", seed)
+    check_whole(seed, lambda value: 0 <= value < 1 << 63, owner, "seed", "in [0, 2⁶³)")
     quilt = _Quilt(sample.normals, output_size, patch_size, overlap, balance, toroidal, seed)
     fronts = quilt.fronts()
     with progress("Synthesising the map") as report:
@@ -278,7 +301,7 @@ class _Quilt:
 
     def __init__(self, normals, size, patch_size, overlap, balance, toroidal, seed) -> None:
         self.normals, self.size, self.overlap, self.toroidal = normals, size, overlap, toroidal
-        self.count = ceil(size / (patch_size - overlap))
+        self.count = cell_count(size, patch_size, overlap)
         self.starts = cell_borders(size, self.count)
         self.steps = np.diff(self.starts)
         # Patches are cut to what the largest cell needs.

@@ -6,6 +6,7 @@ from .filtered import Filtered
 from .grid import Grid
 from .hand_over import HandOver
 from .manifold import Manifold
+from .mip import Mip
 from .tabulated import TabulatedManifold
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "Grid",
     "HandOver",
     "Manifold",
+    "Mip",
     "TabulatedManifold",
 ]

@@ -28,6 +28,7 @@ from scipy.cluster.vq import kmeans2
 from ..gaussian_lobes import SIGMA_H
 from ..progress import progress
 from ..synthesis import Synthesis, jacobians
+from . import packed_lobes
 
 #: Smallest grid, texels: clusters of grids much smaller would hold one or two texels each.
 SMALLEST_GRID = 12
@@ -58,6 +59,10 @@ class Lobes:
         mean = self.mean.copy()
         mean[:, :2] += offset
         return Lobes(self.mass, mean, self.covariance)
+
+    def packed(self, extent: float) -> np.ndarray:
+        """As :func:`~glintbsdf.pndf.packed_lobes.pack` packs them."""
+        return packed_lobes.pack(self.mass, self.mean, self.covariance, extent)
 
     @staticmethod
     def concatenate(parts: list[Lobes]) -> Lobes:
@@ -209,11 +214,11 @@ def build(
             report((len(layout.divisions) + 3 + done) / steps)
     step = float(np.diff(synthesis.starts).max())
     return {
-        "texels": pack(texels, 1.0),
-        "inside": pack(inside, step),
-        "overlaps": pack(overlaps, step),
+        "texels": texels.packed(1.0),
+        "inside": inside.packed(step),
+        "overlaps": overlaps.packed(step),
         "segments": segments,
-        "cells": np.concatenate([pack(level, step * 2**j) for j, level in enumerate(levels)]),
+        "cells": np.concatenate([level.packed(step * 2**j) for j, level in enumerate(levels)]),
     }
 
 
@@ -339,67 +344,3 @@ def _groups_of_cells(synthesis, layout, clustering, members) -> Iterator[Lobes]:
 
 def _none() -> Lobes:
     return Lobes(np.empty(0), np.empty((0, 4)), np.empty((0, 4, 4)))
-
-
-# ------------------------------------------------------------------------------------------------
-#  Packing
-# ------------------------------------------------------------------------------------------------
-
-
-def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """L, B and Q of lobes, N×2×2 each: S = L Lᵀ, cross-covariance B Lᵀ, normals B Bᵀ + Q Qᵀ.
-
-    L and Q are lower triangular. Q Qᵀ is what the normals vary when the position is known, a Schur
-    complement, which rounding may leave just below zero: its roots are then 0.
-    """
-    root = np.linalg.cholesky(covariance[:, :2, :2])
-    cross = np.linalg.solve(root, covariance[:, :2, 2:]).transpose(0, 2, 1)
-    rest = covariance[:, 2:, 2:] - cross @ cross.transpose(0, 2, 1)
-    q = np.zeros_like(rest)
-    q[:, 0, 0] = np.sqrt(np.maximum(rest[:, 0, 0], 0))
-    positive = q[:, 0, 0] > 0
-    q[:, 1, 0] = np.where(positive, rest[:, 1, 0] / np.where(positive, q[:, 0, 0], 1), 0)
-    q[:, 1, 1] = np.sqrt(np.maximum(rest[:, 1, 1] - q[:, 1, 0] ** 2, 0))
-    return root, cross, q
-
-
-def pack(lobes: Lobes, extent: float) -> np.ndarray:
-    """Lobes in 32 bytes each: N×8 words of two 16-bit numbers, the lower one first.
-
-    ====  =============================================================
-    0     mean position (x, y), 65535 for ``extent`` texels
-    1     mass / extent² and L_xx, as all that follow in half precision
-    2     L_yx, L_yy
-    3     √ trace(B Bᵀ + Q Qᵀ), the spread of the normals, and Q_xx
-    4     mean normal (x, y), 65535 for the range from −1 to 1
-    5     Q_yx, Q_yy
-    6, 7  B_xx, B_xy; B_yx, B_yy
-    ====  =============================================================
-
-    L, B and Q as in :func:`factors`, texels and units of projected normals.
-    """
-    real = lobes.mass > 0
-    covariance = np.where(real[:, None, None], lobes.covariance, np.eye(4))
-    root, cross, q = factors(covariance)
-    spread = np.sqrt(np.trace(covariance[:, 2:, 2:], axis1=1, axis2=2))
-
-    def fixed(value: np.ndarray) -> np.ndarray:
-        return np.round(65535 * np.clip(value, 0, 1)).astype(np.uint16)
-
-    def half(value: np.ndarray) -> np.ndarray:
-        return value.astype(np.float16).view(np.uint16)
-
-    x, y = (fixed(lobes.mean[:, axis] / extent) for axis in (0, 1))
-    n_x, n_y = (fixed(0.5 + 0.5 * lobes.mean[:, axis]) for axis in (2, 3))
-    numbers = (
-        (x, y),
-        (half(lobes.mass / extent**2), half(root[:, 0, 0])),
-        (half(root[:, 1, 0]), half(root[:, 1, 1])),
-        (half(spread), half(q[:, 0, 0])),
-        (n_x, n_y),
-        (half(q[:, 1, 0]), half(q[:, 1, 1])),
-        (half(cross[:, 0, 0]), half(cross[:, 0, 1])),
-        (half(cross[:, 1, 0]), half(cross[:, 1, 1])),
-    )
-    words = [low.astype(np.uint32) | (high.astype(np.uint32) << 16) for low, high in numbers]
-    return np.stack(words, axis=1)

@@ -13,108 +13,35 @@ paper's Eq. 9 the weights have changed places.
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
-from math import log2
+from math import inf, log2
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..cache import load_or_build
 from ..errors import check
-from ..gaussian_lobes import SIGMA_H, Gaussian, Overlap
+from ..gaussian_lobes import SIGMA_H
 from ..hashing import pcg3d, uniform
 from ..kernels import SIGMA_MIN, TexelKernel
 from ..normalmap import NormalMap
-from ..synthesis import Synthesis, check_sizes, synthesise
-from . import lobe_levels
+from ..synthesis import Synthesis, check_sizes, check_whole, synthesise
+from . import lobe_levels, packed_lobes
 from .manifold import add_where
 from .mip_grids import Grids
+from .packed_lobes import Lobe
 
-#: Width of a footprint, in standard deviations: its area in Eq. 8 is that of a square as wide.
-WIDTH = 4.0
+#: Width of a footprint, in standard deviations, that of a pixel: its area in Eq. 8 is that of a
+#: square as wide.
+WIDTH = 2.0
 
 #: A footprint more elongated than this counts as wider in Eq. 8, which limits the cost.
 MAX_ANISOTROPY = 16.0
 
-#: Weight of normals against positions when lobes are clustered; see
-#: :class:`~glintbsdf.pndf.lobe_levels.Clustering`. Measured, see ``benchmarks/mip_clusters.py``.
-NORMAL_WEIGHT = 2.0
-
 #: Standard deviations beyond which a lobe's normals are left out: 3e-7 of its mass.
 NORMAL_REACH = 5.5
-
-
-class Lobe:
-    """One packed lobe per lane; see :func:`~glintbsdf.pndf.lobe_levels.pack`."""
-
-    def __init__(self, words: mi.UInt32, index: mi.UInt32, extent: mi.Float, active: mi.Bool):
-        self.words, self.index, self.active = words, index, active
-        packed = dr.gather(mi.Vector4u, words, 2 * index, active)
-        self.position = extent / 65535 * mi.Vector2f(low(packed.x), high(packed.x))
-        mass, xx = halves(packed.y)
-        yx, yy = halves(packed.z)
-        self.mass = mass
-        # Lanes without a lobe must stay finite
-        real = mass > 0
-        self.xx, self.yx, self.yy = dr.select(real, xx, 1), yx, dr.select(real, yy, 1)
-        self.spread, self.q_xx = halves(packed.w)
-
-    def shape(self) -> Gaussian:
-        """S."""
-        return Gaussian((mi.Vector2f(self.xx, self.yx), mi.Vector2f(0, self.yy)))
-
-    def weight(self, seen: Gaussian, d: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
-        """The lobe's mass under a footprint, but for a factor that all have, and the squared
-        distance it is at; 0 for inactive lanes."""
-        total = Gaussian(seen.vectors + self.shape().vectors)
-        distance = total.distance_squared(d)
-        weight = self.mass * dr.rsqrt(total.determinant) * dr.exp(-0.5 * distance)
-        return dr.select(self.active, weight, 0), distance
-
-    def normals_under(self, seen: Gaussian, d: mi.Vector2f, variance: mi.Float) -> tuple:
-        """Distribution of the lobe's normals under a footprint about their mean, and that mean.
-
-        ``variance``: σ_r².
-        """
-        packed = dr.gather(mi.Vector4u, self.words, 2 * self.index + 1, self.active)
-        mean = normal_of(packed.x)
-        q_yx, q_yy = halves(packed.y)
-        rows = []
-        for word in (packed.z, packed.w):  # of the Jacobian B L⁻¹
-            along_x, along_y = halves(word)
-            j_y = along_y / self.yy
-            rows += [(along_x - j_y * self.yx) / self.xx, j_y]
-        jacobian = mi.Matrix2f(*rows)
-        rest = Gaussian((mi.Vector2f(self.q_xx, q_yx), mi.Vector2f(0, q_yy)), variance)
-        overlap = Overlap(seen, self.shape())
-        return overlap.normals(jacobian, rest), mean + jacobian @ overlap.mean(d)
-
-    def mean_normal(self) -> mi.Vector2f:
-        """The mean normal."""
-        return normal_of(dr.gather(mi.UInt32, self.words, 8 * self.index + 4, self.active))
-
-
-def low(word: mi.UInt32) -> mi.Float:
-    """The lower sixteen bits as a number."""
-    return mi.Float(word & 0xFFFF)
-
-
-def high(word: mi.UInt32) -> mi.Float:
-    """The upper sixteen bits as a number."""
-    return mi.Float(word >> 16)
-
-
-def normal_of(word: mi.UInt32) -> mi.Vector2f:
-    """A packed normal."""
-    return mi.Vector2f(low(word), high(word)) * (2 / 65535) - 1
-
-
-def halves(word: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """The two half-precision numbers in a word; a half's exponent is 112 less than a float's."""
-    return tuple(
-        dr.reinterpret_array(mi.Float, ((half & 0x7FFF) << 13) | ((half & 0x8000) << 16)) * 2.0**112
-        for half in (word & 0xFFFF, word >> 16)
-    )
 
 
 class Mip:
@@ -128,11 +55,13 @@ class Mip:
         normal_map (NormalMap): the sample.
         output_size, patch_size, overlap, balance, seed: see
             :func:`~glintbsdf.synthesis.synthesise`.
-        clusters (int): k ≥ 1, lobes per grid of each level.
+        clusters (int): k, lobes per grid of each level, from 1 to 1024.
         lod_scale (float): C_P ≥ 0 of Eq. 8, λ = C_P log₂ P with P the footprint's area in texels,
-            (4σ)² for a round one. With 1/2, a level's grids are as wide as the footprint.
+            (2σ)² for a round one. With 1/2, a level's grids are as wide as the footprint.
         sigma_r (float): intrinsic roughness, the standard deviation of normals about those of the
             map, > 0.
+        normal_weight (float): weight ≥ 0 of normals against positions where lobes are clustered;
+            see :class:`~glintbsdf.pndf.lobe_levels.Clustering`.
         owner (str): whom errors name, usually the plugin.
 
     Attributes:
@@ -158,13 +87,16 @@ class Mip:
         balance: float = 0.9,
         sigma_r: float = 0.005,
         seed: int = 0,
+        normal_weight: float = 8.0,
         owner: str = "Mip",
     ) -> None:
         sample = (normal_map.height, normal_map.width)
         check_sizes(sample, output_size, patch_size, overlap, owner)
-        check(1 <= clusters <= 1024, owner, "clusters", "a whole number from 1 to 1024", clusters)
+        check_whole(clusters, lambda k: 1 <= k <= 1024, owner, "clusters", "from 1 to 1024")
         check(0 <= lod_scale < 16, owner, "lod_scale", "a number in [0, 16)", lod_scale)
+        check(0 <= normal_weight < inf, owner, "normal_weight", "a number ≥ 0", normal_weight)
         self.clusters, self.lod_scale, self.owner = clusters, float(lod_scale), owner
+        self.normal_weight = float(normal_weight)
         self.options = {
             "output_size": output_size,
             "patch_size": patch_size,
@@ -185,22 +117,29 @@ class Mip:
 
     def build(self, sample: NormalMap) -> None:
         """Synthesise the map and cluster its lobes; the cache on disk may know them already."""
-        self.sample_map = sample
+        distinct = len(np.unique(sample.normals.view(np.complex64)))
+        if distinct < self.clusters:
+            warnings.warn(
+                f"{self.owner}: the sample has {distinct} distinct normals, fewer than "
+                f'"clusters" = {self.clusters}: lobes that differ in position only are kept apart',
+                stacklevel=2,
+            )
         options = {**self.options, "toroidal": self.wrap_mode == "repeat"}
         synthesis_key = " ".join(f"{name}={value!r}" for name, value in options.items())
         key = (
-            f"mip {lobe_levels.VERSION} {sample.content_hash} {synthesis_key} "
-            f"{self.clusters} {NORMAL_WEIGHT}"
+            f"mip {lobe_levels.VERSION}.{packed_lobes.VERSION} {sample.content_hash} "
+            f"{synthesis_key} {self.clusters} {self.normal_weight}"
         )
 
         def build() -> dict:
             synthesis = synthesise(sample, **options, owner=self.owner)
             levels = lobe_levels.build(
-                synthesis, self.clusters, NORMAL_WEIGHT, self.options["seed"]
+                synthesis, self.clusters, self.normal_weight, self.options["seed"]
             )
             return {**synthesis.arrays(), **levels}
 
         arrays = load_or_build(key, build)
+        self.__dict__.pop("normal_map", None)
         self.synthesis = Synthesis.from_arrays(
             sample.normals, self.options["output_size"], self.options["overlap"], arrays
         )
@@ -254,13 +193,14 @@ class Mip:
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
             # A texel's lobe is as wide as a texel: those around the footprint count as well.
-            added = dr.select(level == 0, SIGMA_H**2, 0)
+            added = dr.select(level == 0, mi.Float(SIGMA_H**2), 0)
             reach = self.texel_kernel(footprint, added)
             centre = mi.Vector2f(reach.mean) + 0.5  # from the map's edge
             rows, columns = grids.y.on(level, active), grids.x.on(level, active)
             top = rows.locate(centre.y - reach.reach_v)
             bottom = rows.locate(centre.y + reach.reach_v)
             extent = dr.gather(mi.Float, grids.extent, level, active)
+        texels = level == 0
         mean = mi.Vector2f(kernel.mean) + 0.5
 
         def next_row(y, x, right):
@@ -283,13 +223,18 @@ class Mip:
             inside = y <= bottom
             row, turn_y, flipped_y = rows.at(y)
             column, turn_x, flipped_x = columns.at(x)
-            first, count, first_2, count_2 = grids.run(level, rows, columns, row, column, inside)
+            first, count, first_2, count_2 = grids.run(
+                level, rows, columns, row, column, flipped_x, inside
+            )
             origin = mi.Vector2f(
                 columns.placed(columns.origin(column), turn_x, flipped_x),
                 rows.placed(rows.origin(row), turn_y, flipped_y),
             )
             if mirrored:
                 sign = mi.Vector2f(dr.select(flipped_x, -1, 1), dr.select(flipped_y, -1, 1))
+            # Texels of a run are grids of their own
+            count = dr.select(texels, dr.minimum(count, mi.UInt32(right - x + 1)), count)
+            x = dr.select(texels, x + mi.Int(count) - 1, x)
             return first, count, first_2, count_2, y, x, right, origin, sign
 
         def next_run(first, count, first_2, count_2, *rest):
@@ -311,9 +256,10 @@ class Mip:
             )
             first, count, first_2, count_2, y, x, right, origin, sign = walk
             inside = active & (y <= bottom) & (count > 0)
-            lobe = Lobe(self.words, first, extent, inside)
+            lobe = Lobe(self.words, first, extent, *self.seen(kernel, sign), inside)
             state = add(state, lobe, (mean - origin) * sign - lobe.position, sign, inside)
             count = dr.select(inside, count - 1, count)
+            origin = mi.Vector2f(dr.select(texels, origin.x + 1, origin.x), origin.y)
             return state, (first + 1, count, first_2, count_2, y, x, right, origin, sign)
 
         walk = (
@@ -356,17 +302,17 @@ class Mip:
 
         def add(state, lobe, d, sign, active):
             density, mass = state
-            seen = self.seen(kernel, sign)
-            weight, distance = lobe.weight(seen, d)
+            weight, distance = lobe.weight(d)
 
             def contribution():
-                normals, mean = lobe.normals_under(seen, d, variance)
+                mean, normals = lobe.normals(d, variance)
                 return weight * normals.eval(m - mean)
 
-            # Means move with the footprint by less than the spread times √distance.
-            mean = lobe.mean_normal()
-            far = dr.fma(lobe.spread, dr.sqrt(distance) + NORMAL_REACH, NORMAL_REACH * self.sigma_r)
-            near = active & (dr.squared_norm(m - mean) < dr.square(far))
+            # The mean moves with the footprint by less than the spread times √distance.
+            far = lobe.spread * dr.sqrt(distance) + NORMAL_REACH * dr.sqrt(
+                dr.fma(lobe.spread, lobe.spread, variance)
+            )
+            near = active & (dr.squared_norm(m - lobe.mean_normal()) < dr.square(far))
             return add_where(density, near, contribution, active), mass + weight
 
         state = mi.Float(0), mi.Float(0)
@@ -389,7 +335,7 @@ class Mip:
 
         def add(state, lobe, d, sign, active):
             mass, turn, index, place, side = state
-            weight, _ = lobe.weight(self.seen(kernel, sign), d)
+            weight, _ = lobe.weight(d)
             mass = mass + weight
             chosen = uniform(pcg3d(turn, name, 0)[0]) * mass < weight
             return (
@@ -405,17 +351,20 @@ class Mip:
         mass, _, index, place, side = state
         active &= mass > 0
         extent = dr.gather(mi.Float, self.grids.extent, level, active)
-        lobe = Lobe(self.words, index, extent, active)
-        normals, mean = lobe.normals_under(self.seen(kernel, side), place, dr.square(self.sigma_r))
+        lobe = Lobe(self.words, index, extent, *self.seen(kernel, side), active)
+        mean, normals = lobe.normals(place, dr.square(self.sigma_r))
         return mean + normals.sample(mi.warp.square_to_std_normal(mi.Point2f(sample2)))
 
-    def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> Gaussian:
-        """Σ_p, texels², in the frame of a copy of the map."""
+    def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> tuple[tuple, mi.Float]:
+        """Two vectors that make up the footprint's covariance (texels²), in the frame of a copy of
+        the map, and its determinant."""
         vectors = (
             mi.Vector2f(kernel.sigma_u_given_v, 0),
             mi.Vector2f(kernel.shear * kernel.sigma_v, kernel.sigma_v),
         )
-        return Gaussian(vectors if self.wrap_mode == "repeat" else tuple(v * sign for v in vectors))
+        if self.wrap_mode != "repeat":
+            vectors = tuple(v * sign for v in vectors)
+        return vectors, dr.square(kernel.sigma_u_given_v * kernel.sigma_v)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)

@@ -157,17 +157,21 @@ class Grids:
         tables = (self.patch, self.origins, self.owners, self.segments)
         return 4 * sum(dr.width(v) for v in tables) + self.x.nbytes
 
-    def run(self, level, row: AxisLevel, column: AxisLevel, y, x, active):
+    def run(self, level, row: AxisLevel, column: AxisLevel, y, x, flipped, active):
         """The lobes of the stored grid (``y``, ``x``): ``(first, count, first_2, count_2)``.
 
-        The second run, of those in the cell's overlaps, is empty but for divisions of cells.
+        The second run, of those in the cell's overlaps, is empty but for divisions of cells. For
+        texels, the run goes on over those that follow in x, as far as their lobes do, unless the
+        map is ``flipped`` in x.
         """
         first_of_level = dr.gather(mi.UInt32, self.first, level, active)
         texels, cells = level == 0, level > self.divisions
         group = first_of_level + y * mi.UInt32(row.period) + x
         first = self.cells + group * self.clusters
-        first = dr.select(texels, self.source(y, x, active & texels), first)
-        count = dr.select(texels, mi.UInt32(1), mi.UInt32(self.clusters))
+        source, following = self.source(y, x, active & texels)
+        first = dr.select(texels, source, first)
+        following = dr.select(flipped, 1, following)
+        count = dr.select(texels, following, mi.UInt32(self.clusters))
         first_2 = count_2 = mi.UInt32(0)
         if self.divisions:
             inside = active & ~texels & ~cells
@@ -187,8 +191,9 @@ class Grids:
             count_2 = dr.select(inside, end - begin, 0)
         return first, count, first_2, count_2
 
-    def source(self, y: mi.UInt32, x: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-        """The sample's texel that the texel (``y``, ``x``) of the map shows."""
+    def source(self, y: mi.UInt32, x: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        """The sample's texel that the texel (``y``, ``x``) of the map shows, and the number of
+        texels from here on that it is known to go on without a break."""
         cells, offsets, steps = [], [], []
         for index, axis in ((y, self.y), (x, self.x)):
             cell = dr.gather(mi.UInt32, axis.cell_of, index, active)
@@ -217,7 +222,8 @@ class Grids:
             cells[k] = dr.select(before, cell, cells[k])
         patch = dr.gather(mi.UInt32, self.patch, cells[0] * self.count + cells[1], active)
         origin = dr.gather(mi.Vector2u, self.origins, patch, active)
-        return (origin.x + offsets[0]) * self.width + origin.y + offsets[1]
+        source = (origin.x + offsets[0]) * self.width + origin.y + offsets[1]
+        return source, dr.select(cut, 1, steps[1] - offsets[1])
 
 
 def _packed_owners(owners: np.ndarray) -> np.ndarray:
