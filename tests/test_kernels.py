@@ -108,6 +108,32 @@ def test_limit_extent_keeps_the_width_of_a_long_footprint(variant):
     assert abs(wide - 1) < 1e-4 and abs(narrow - 0.03) < 1e-4
 
 
+@pytest.mark.parametrize("length", [1e3, 1e8, 1e15])
+def test_limit_extent_of_parallel_axes(variant, length):
+    # What a cone of rays at a grazing angle makes: the narrow axis is lost in rounding, and the
+    # footprint must not grow with the noise.
+    along = mi.Vector2f(cos(2.4), sin(2.4)) * length
+    for du, dv in ((along, -0.876 * along), (0.3 * along, along), (along, mi.Vector2f(0))):
+        du, dv = (np.array(v, np.float64)[:, 0] for v in limit_extent(du, dv))
+        assert np.sqrt(np.linalg.norm(np.outer(du, du) + np.outer(dv, dv), 2)) <= 1 + 1e-6
+
+
+@pytest.mark.parametrize("size", [1.0, 3.0])
+def test_limit_extent_of_a_round_footprint(variant, size):
+    du, dv = limit_extent(mi.Vector2f(size, 0), mi.Vector2f(0, size))
+    du, dv = (np.array(v, np.float64)[:, 0] for v in (du, dv))
+    assert np.allclose(np.outer(du, du) + np.outer(dv, dv), np.eye(2), atol=1e-6)
+
+
+def test_derivatives_of_limit_extent_are_finite(variant):
+    for width in (0.0, 0.5, 1.0, 3.0):
+        scale = dr.opaque(mi.Float, width)
+        dr.enable_grad(scale)
+        du, dv = limit_extent(mi.Vector2f(scale, 0), mi.Vector2f(0, scale))
+        dr.backward(dr.squared_norm(du) + dr.squared_norm(dv))
+        assert dr.all(dr.isfinite(dr.grad(scale)))
+
+
 def test_small_footprints_are_not_limited(variant):
     du, dv = limit_extent(mi.Vector2f(0.9, 0.1), mi.Vector2f(0, 0.2))
     assert dr.allclose(du, [0.9, 0.1]) and dr.allclose(dv, [0, 0.2])

@@ -36,43 +36,47 @@ SIGMA_MIN = 1 / 128
 #: is uniform to 5e-9 (Poisson summation), 2e-3 with its cut at ρ = 3; a wider one only costs more.
 SIGMA_MAX = 1.0
 
-
-def limit_extent(du, dv):
-    """Limit the principal standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX`.
-
-    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns the two limited vectors. Works on the factor,
-    never on Σ⁻¹, so that a footprint 1000 times longer than wide keeps its width.
-    """
-    a = dr.fma(du.x, du.x, dv.x * dv.x)
-    c = dr.fma(du.y, du.y, dv.y * dv.y)
-    b = dr.fma(du.x, du.y, dv.x * dv.y)
-    mean, difference = 0.5 * (a + c), 0.5 * (a - c)
-    radius = dr.safe_sqrt(dr.fma(difference, difference, b * b))
-    # The eigenvector of the larger eigenvalue, from the row of Σ − λ₂ I that does not cancel.
-    major = dr.select(
-        difference >= 0, mi.Vector2f(difference + radius, b), mi.Vector2f(b, radius - difference)
-    )
-    length = dr.norm(major)
-    found = length > 0
-    major = dr.select(found, major / dr.select(found, length, 1), mi.Vector2f(1, 0))
-    minor = mi.Vector2f(-major.y, major.x)
-
-    def shorten(variance):
-        return 1 - dr.minimum(SIGMA_MAX * dr.rsqrt(dr.maximum(variance, SIGMA_MAX**2)), 1)
-
-    shorten_major, shorten_minor = shorten(mean + radius), shorten(mean - radius)
-
-    def limited(d):
-        along_major, along_minor = dr.dot(major, d), dr.dot(minor, d)
-        return d - shorten_major * along_major * major - shorten_minor * along_minor * minor
-
-    return limited(du), limited(dv)
+#: Keeps square roots, and their derivatives, of a round footprint finite.
+TINY = 1e-20
 
 
 def difference_of_products(a, b, c, d):
     """a b − c d without cancellation (Kahan: a fused multiply-add recovers the rounding error)."""
     cd = c * d
     return dr.fma(a, b, -cd) + dr.fma(-c, d, cd)
+
+
+def limit_extent(du, dv):
+    """Limit the principal standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX`.
+
+    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns two vectors with the limited covariance: those
+    given where nothing is to be limited, principal axes elsewhere. Works on the factor, never on Σ,
+    so that a footprint 10⁸ times longer than the map is limited, and keeps its width.
+    """
+    longer = dr.squared_norm(du) >= dr.squared_norm(dv)
+    a, b = dr.select(longer, du, dv), dr.select(longer, dv, du)
+    length = dr.norm(a)
+    found = length > 0
+    along = dr.select(found, a / dr.select(found, length, 1), mi.Vector2f(1, 0))
+    # In axes along and across a, and in units of its length, a is (1, 0) and b is (p, q).
+    per_length = dr.rcp(dr.select(found, length, 1))
+    p = dr.dot(along, b) * per_length
+    q = difference_of_products(along.x, b.y, along.y, b.x) * per_length
+    half = 0.5 * (1 + (p - q) * (p + q))  # of the difference of the variances, ≥ p² ≥ 0
+    radius = dr.sqrt(dr.fma(half, half, p * p * q * q) + TINY)
+    larger = half + radius + q * q  # eigenvalue, in [1, 2]; the smaller one is q²/larger
+    across, tilt = mi.Vector2f(-along.y, along.x), mi.Vector2f(half + radius, p * q)
+    tilt = tilt * dr.rsqrt(dr.squared_norm(tilt))
+    major = along * tilt.x + across * tilt.y
+    minor = across * tilt.x - along * tilt.y
+
+    root = dr.sqrt(larger)
+    sigma_major, sigma_minor = length * root, length * dr.abs(q) / root
+    above = sigma_major > SIGMA_MAX
+    return (
+        dr.select(above, major * dr.minimum(sigma_major, SIGMA_MAX), du),
+        dr.select(above, minor * dr.minimum(sigma_minor, SIGMA_MAX), dv),
+    )
 
 
 class TexelKernel:
