@@ -65,6 +65,22 @@ class Axis:
         end = dr.select(before, block, dr.select(after, self.quads, last))
         return origin - block, x - origin, end
 
+    def touched_blocks(self, first: int, last: int) -> tuple[int, int]:
+        """The stored blocks in which the positions from ``first`` to ``last`` (texels) lie.
+
+        Returns the first and their number: all, where the positions cross the stored border.
+        """
+        if self.clamped:
+            first = min(max(first + self.block, 0), self.quads - self.block)
+            last = min(max(last + self.block, 0), self.quads - 1)
+            if first < self.block:  # any place in the border stands for what is beyond
+                first = 0
+            if last >= self.quads - self.block:
+                last = self.quads - 1
+        elif first < 0 or last >= self.quads:
+            return 0, self.blocks
+        return first // self.block, last // self.block - first // self.block + 1
+
     def following(self, x, index):
         """Where the quad after ``x`` is stored, given where ``x`` is."""
         if self.clamped:

@@ -9,6 +9,8 @@ no tree, no stack, nothing visited that is not near in both position and normal.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -39,10 +41,11 @@ STRIP_COUNTERS = 1 << 23
 # ------------------------------------------------------------------------------------------------
 
 
-def every_quad(lattice: Lattice, kernel, add, active):
+def every_quad(lattice: Lattice, kernel, add, active, zero=None):
     """Sum over all quads that the kernel's bounding box touches; see :meth:`QuadLists.visit`.
 
-    The right loop for footprints of a few texels, where searching costs more than it saves.
+    The right loop for footprints of a few texels, where searching costs more than it saves. The sum
+    begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
     """
     mean = mi.Vector2f(kernel.mean)
     left, top = floor_int(mean.x - kernel.reach_u), floor_int(mean.y - kernel.reach_v)
@@ -63,7 +66,7 @@ def every_quad(lattice: Lattice, kernel, add, active):
         mi.Int(first_column),
         first_row,
         mi.Bool(active),
-        mi.Float(0),
+        mi.Float(0) if zero is None else zero,
     )
     return dr.while_loop(
         state, lambda *state: state[4], body, max_iterations=-1, label="every quad"
@@ -228,8 +231,22 @@ class NormalCells:
         return mi.Float(x.astype(np.float32)), mi.Float(y.astype(np.float32))
 
 
+class Window(NamedTuple):
+    """A rectangle of blocks of quads: ``(first, number)`` of its rows, and of its columns."""
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+    @staticmethod
+    def whole(lattice: Lattice) -> Window:
+        """All blocks."""
+        return Window((0, lattice.y.blocks), (0, lattice.x.blocks))
+
+
 class QuadLists:
     """The lists, of the arrays that :meth:`build` makes, wherever those were kept since.
+
+    ``window``: the blocks that have lists, all by default. Queries must not touch any other.
 
     Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
         ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
@@ -239,8 +256,10 @@ class QuadLists:
 
     VERSION = 1
 
-    def __init__(self, lattice: Lattice, arrays: dict[str, np.ndarray]) -> None:
-        self.lattice = lattice
+    def __init__(
+        self, lattice: Lattice, arrays: dict[str, np.ndarray], window: Window | None = None
+    ) -> None:
+        self.lattice, self.window = lattice, window or Window.whole(lattice)
         self.cells = NormalCells(
             arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
         )
@@ -260,14 +279,16 @@ class QuadLists:
         ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
         it returns the new ``density``. Sums are differentiable in both modes.
         """
-        count, width = self.cells.divisions**2, self.lattice.x.blocks + 1
+        (first_row, _), (first_column, columns) = self.window
+        count, width = self.cells.divisions**2, columns + 1
         cell = self.cells.cell(m, active)
 
         def run_of(block_row, first, last, active):
-            list_index = block_row * count + cell
+            list_index = (block_row - first_row) * count + cell
             start = dr.gather(mi.UInt32, self.start, list_index, active)
             return tuple(
-                start + self.offset[list_index * width + k, active] for k in (first, last + 1)
+                start + self.offset[list_index * width + k, active]
+                for k in (first - first_column, last + 1 - first_column)
             )
 
         def quad_of(entry, row, found):
@@ -281,14 +302,17 @@ class QuadLists:
     # --------------------------------------------------------------------------------------------
 
     @staticmethod
-    def build(lattice: Lattice, triangles, normals: np.ndarray, bounds) -> dict[str, np.ndarray]:
-        """Build the arrays, in two passes over the lattice: count, then fill.
+    def build(
+        lattice: Lattice, triangles, normals: np.ndarray, bounds, window: Window | None = None
+    ) -> dict[str, np.ndarray]:
+        """Build the arrays, in two passes over the lattice, or a window of it: count, then fill.
 
         ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
         and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
         rectangle (lower, upper), inside which all triangles lie.
         """
-        return Builder(BlocksOfQuads(lattice, triangles), normals, bounds).arrays()
+        window = window or Window.whole(lattice)
+        return Builder(BlocksOfQuads(lattice, triangles, window), normals, bounds).arrays()
 
 
 def reaches(triangle, centre, half):
@@ -310,7 +334,7 @@ def reaches(triangle, centre, half):
 
 
 class BlocksOfQuads:
-    """What :class:`Builder` makes lists of: here, the quads of a lattice.
+    """What :class:`Builder` makes lists of: here, the quads of a window of a lattice.
 
     Attributes:
         rows, columns (int): blocks.
@@ -318,9 +342,9 @@ class BlocksOfQuads:
         largest_entry (int): bounds the entries.
     """
 
-    def __init__(self, lattice: Lattice, triangles) -> None:
+    def __init__(self, lattice: Lattice, triangles, window: Window) -> None:
         self.lattice, self.triangles_of_quad = lattice, triangles
-        self.rows, self.columns = lattice.y.blocks, lattice.x.blocks
+        (self.first_row, self.rows), (self.first_column, self.columns) = window
         self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
 
     def count(self, block_row, block_column):
@@ -329,14 +353,15 @@ class BlocksOfQuads:
 
     def triangles(self, block_row, block_column, quad, active):
         """Whether the ``quad``-th of a block exists, and its two triangles."""
-        row = block_row * BLOCK + (quad >> SHIFT)
-        column = block_column * BLOCK + (quad & (BLOCK - 1))
+        row = (self.first_row + block_row) * BLOCK + (quad >> SHIFT)
+        column = (self.first_column + block_column) * BLOCK + (quad & (BLOCK - 1))
         exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
         return exists, self.triangles_of_quad(row, column, exists)
 
     def entry(self, block_row, block_column, quad):
         """What the lists say of the ``quad``-th of a block."""
-        return ((block_column * BLOCK + (quad & (BLOCK - 1))) << SHIFT) | (quad >> SHIFT)
+        column = (self.first_column + block_column) * BLOCK + (quad & (BLOCK - 1))
+        return (column << SHIFT) | (quad >> SHIFT)
 
 
 class Builder:
