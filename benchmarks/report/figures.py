@@ -1,0 +1,183 @@
+"""The pictures: error against time, memory and samples. Needs matplotlib."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from . import pareto
+
+#: Okabe and Ito's colours, told apart by all eyes, and markers, by family in order of appearance.
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#000000", "#999999")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+METRICS = {"l1": "relative L1 error", "l2": "relative L2 error", "maximum": "maximum error"}
+
+STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "glintbsdf",
+    "font.size": 8,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "axes.axisbelow": True,
+    "axes.titlesize": 9,
+    "legend.frameon": False,
+}
+
+
+class Palette:
+    """A colour and a marker for every family; filters and baselines differ by marker as well."""
+
+    def __init__(self, families: list[str]) -> None:
+        families = list(dict.fromkeys(families))
+        self.families = families
+        self.colour = {f: COLOURS[i % len(COLOURS)] for i, f in enumerate(families)}
+        self.marker = {f: MARKERS[i % len(MARKERS)] for i, f in enumerate(families)}
+
+
+def save(figure: Figure, folder: Path, name: str) -> str:
+    """Write PNG and SVG; returns the SVG as text to put into a page."""
+    figure.savefig(folder / f"{name}.png", dpi=140)
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    svg = text.getvalue()
+    (folder / f"{name}.svg").write_text(svg, encoding="utf-8")
+    return svg[svg.index("<svg") :]
+
+
+def draw(folder: Path, name: str, plot, *arguments) -> str:
+    """A figure by one of the functions below, saved."""
+    with matplotlib.rc_context(STYLE):
+        return save(plot(name, *arguments), folder, name)
+
+
+def panels(count: int, width: float = 3.1, height: float = 2.7, most: int = 5):
+    """A figure and ``count`` axes, in rows of at most ``most``."""
+    columns = min(count, most) if count % most == 0 or count < most else -(-count // 2)
+    columns = min(columns, most)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes[count:]:
+        axis.remove()
+    return figure, axes[:count]
+
+
+def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: str) -> Figure:
+    """Error against ``cost`` for one map, one panel per footprint; a point's id is its ``id``."""
+    figure, axes = panels(len(units))
+    scale, label = {
+        "seconds_per_query": (1e6, "time per query (µs)"),
+        "bytes": (1e-6, "memory (MB)"),
+    }[cost]
+    seen = {}
+    for axis, unit in zip(axes, units, strict=True):
+        points = [point for point in unit["points"] if point[cost] > 0]
+        on_front = set(pareto.front(points, cost, metric))
+        front = sorted((p for p in points if p["method"] in on_front), key=lambda p: p[cost])
+        axis.plot(
+            [scale * p[cost] for p in front],
+            [p[metric] for p in front],
+            drawstyle="steps-post",
+            color="#c8c8c8",
+            linewidth=3,
+            zorder=1,
+        )
+        for sigma, floor in unit["noise_floor"].items():
+            style = "--" if float(sigma) == 0 else ":"
+            axis.axhline(floor[metric], linestyle=style, color="#777777", linewidth=0.9, zorder=1)
+        for family in palette.families:
+            own = [p for p in points if p["family"] == family]
+            if len(own) > 1 and all(p["rung"] is not None for p in own):
+                own.sort(key=lambda p: p["rung"])
+                axis.plot(
+                    [scale * p[cost] for p in own],
+                    [p[metric] for p in own],
+                    color=palette.colour[family],
+                    linewidth=0.8,
+                )
+            for point in own:
+                (mark,) = axis.plot(
+                    [scale * point[cost]],
+                    [point[metric]],
+                    palette.marker[family],
+                    color=palette.colour[family],
+                    markersize=6 if point["method"] in on_front else 4.5,
+                    markeredgecolor="white",
+                    markeredgewidth=0.5,
+                    zorder=3,
+                    gid=f"{name}--{point['id']}",
+                )
+                seen.setdefault(family, mark)
+        axis.set(xscale="log", yscale="log", title=f"r = {unit['radius']:g} texels")
+        axis.set_xlabel(label)
+    axes[0].set_ylabel(METRICS[metric])
+    figure.legend(seen.values(), seen.keys(), loc="outside lower center", ncols=len(seen))
+    return figure
+
+
+def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> Figure:
+    """Time per query against the footprint's size, one panel per map."""
+    figure, axes = panels(len(units_of_maps), most=3)
+    lines = {}
+    for axis, (title, units) in zip(axes, units_of_maps.items(), strict=True):
+        methods = [point["method"] for point in units[0]["points"]]
+        for method in methods:
+            own = [next(p for p in unit["points"] if p["method"] == method) for unit in units]
+            family = own[0]["family"]
+            (line,) = axis.plot(
+                [unit["radius"] for unit in units],
+                [1e6 * point["seconds_per_query"] for point in own],
+                marker=palette.marker[family],
+                markersize=3,
+                linewidth=0.9,
+                color=palette.colour[family],
+            )
+            lines.setdefault(family, line)
+        axis.set(xscale="log", yscale="log", title=title)
+        axis.set_xlabel("radius r of the footprint (texels)")
+    axes[0].set_ylabel("time per query (µs)")
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(lines))
+    return figure
+
+
+def images(name: str, points: list[dict], noise: float, names: list[str]) -> Figure:
+    """Error of images against time and against samples, with 95 % bands over the seeds."""
+    figure, axes = panels(2, width=4.6, height=3.6)
+    colours = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))
+    for index, method in enumerate(names):
+        own = sorted(
+            (point for point in points if point["method"] == method),
+            key=lambda point: point["samples_per_pixel"],
+        )
+        for axis, x in zip(axes, ("seconds", "samples_per_pixel"), strict=True):
+            at = [point[x] for point in own]
+            colour = colours[index % 20]
+            axis.fill_between(
+                at,
+                [point["rmse_low"] for point in own],
+                [point["rmse_high"] for point in own],
+                color=colour,
+                alpha=0.2,
+                linewidth=0,
+            )
+            axis.plot(at, [p["rmse"] for p in own], color=colour, linewidth=1, label=method)
+            for point in own:
+                axis.plot(
+                    [point[x]],
+                    [point["rmse"]],
+                    MARKERS[index % len(MARKERS)],
+                    color=colour,
+                    markersize=4,
+                    gid=f"{name}-{x}--{point['id']}",
+                )
+    for axis, label in zip(axes, ("seconds of rendering", "samples per pixel"), strict=True):
+        axis.axhline(noise, linestyle="--", color="#777777", linewidth=0.9)
+        axis.set(xscale="log", yscale="log", xlabel=label)
+    axes[0].set_ylabel("relative RMSE")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper")
+    return figure

@@ -1,0 +1,94 @@
+"""``glint_grid``, which has no map: against its own mean, and against itself without approximation.
+
+Its details are random by definition, so that no picture of theirs is more right than another. What
+its ladder of ``max_anisotropy`` trades is contrast: a footprint more stretched than that is
+widened, and more details average out. The error is the relative loss of contrast (standard
+deviation over places, over the mean) against the largest ratio; the mean must stay that of the
+smooth surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.footprint import Footprint
+from glintbsdf.pndf.grid import Grid, beckmann, slope_jacobian
+
+from .pndf import seconds
+
+#: Of the footprint: its axes are as 1 to this.
+STRETCH = 64.0
+
+LADDER = (1.0, 4.0, 16.0, 64.0)
+
+#: Details per unit UV area (log10), and the minor standard deviation of the footprint, UV.
+DENSITY, SIGMA = 5.0, 2e-3
+
+#: Side of the square that places are drawn from, UV: few of their footprints meet.
+EXTENT = 1e3
+
+ALPHA = 0.3
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``places``: independent ones, over which mean and contrast are taken."""
+
+    places: int
+    repetitions: int
+
+
+def measure(settings: Settings):
+    """A unit of the store: mean, contrast and time of every rung."""
+    u, v, turn = np.random.default_rng(1).random((3, settings.places))
+    axis = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)])
+    across = np.stack([-axis[1], axis[0]])
+    footprint = Footprint(
+        mi.Point2f(np.float32(EXTENT * np.stack([u, v]))),
+        mi.Vector2f(np.float32(SIGMA * STRETCH * axis)),
+        mi.Vector2f(np.float32(SIGMA * across)),
+    )
+    m = mi.Vector2f(dr.opaque(mi.Float, 0.1), dr.opaque(mi.Float, -0.05))
+    cos_theta = dr.sqrt(1 - dr.squared_norm(m))
+    smooth = beckmann(m / cos_theta, mi.Vector2f(ALPHA)) * slope_jacobian(cos_theta)
+    dr.eval(footprint.uv, footprint.du, footprint.dv, m, smooth)
+    rungs = {
+        ratio: Grid(alpha=(ALPHA, ALPHA), density=DENSITY, max_anisotropy=ratio) for ratio in LADDER
+    }
+    # The first round compiles, and tells the values.
+    values = {
+        ratio: (pndf.eval(m, footprint) / smooth).numpy().astype(np.float64)
+        for ratio, pndf in rungs.items()
+    }
+    taken = {ratio: [] for ratio in rungs}
+    for _ in range(settings.repetitions + 1):
+        for ratio, pndf in rungs.items():
+            taken[ratio].append(seconds(pndf, m, footprint))
+    full = contrast(values[LADDER[-1]])
+    points = [
+        {
+            "max_anisotropy": ratio,
+            "mean": float(value.mean()),
+            "mean_error": float(value.std() / settings.places**0.5),
+            "contrast": contrast(value),
+            "contrast_error": contrast_error(value),
+            "loss_of_contrast": 1 - contrast(value) / full,
+            "seconds_per_query": float(np.median(taken[ratio][1:])) / settings.places,
+        }
+        for ratio, value in values.items()
+    ]
+    return {"stretch": STRETCH, "points": points}, {}
+
+
+def contrast(values: np.ndarray) -> float:
+    return float(values.std() / values.mean())
+
+
+def contrast_error(values: np.ndarray, parts: int = 32) -> float:
+    """Standard error of the contrast, from that of parts of the places."""
+    found = [contrast(part) for part in np.array_split(values, parts)]
+    return float(np.std(found, ddof=1) / parts**0.5)

@@ -1,0 +1,202 @@
+"""The image level: error against the brute-force truth, at equal numbers of samples and times."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.stats
+from curved_patch import curved_patch
+
+from glintbsdf.rendering import pixel_angle
+from glintbsdf.truth import Truth, reference_render
+
+from .methods import BASELINES, Method, Surface
+from .pndf import timed
+
+#: Radius of the lights: brute force finds the scene's own too seldom.
+LIGHT_RADIUS = 0.07
+
+#: Standard deviation of a box of one pixel: footprints have the variance of the truth's pixels.
+FOOTPRINT_SIGMA = 12**-0.5
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the image level is measured.
+
+    ``maps`` are the names of the cases; maps from files are always taken. ``scales`` say how often
+    the map repeats on the patch, and so how many texels a pixel sees. ``budgets`` are samples per
+    pixel; every one is rendered with ``seeds`` seeds.
+    """
+
+    map_size: int
+    maps: tuple[str, ...]
+    scales: tuple[float, ...]
+    size: int
+    truth_spp: int
+    budgets: tuple[int, ...]
+    seeds: int
+
+
+class Renderer:
+    """A process with the scene of one material.
+
+    Dr.Jit traces every BSDF that lives in a process into every kernel, so that several scenes in
+    one would be compiled into each other; and each build and first frame is that of a user.
+
+    Attributes:
+        building, first_frame (float): seconds; the first frame has one sample per pixel, and
+            compiles.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, other = context.Pipe()
+        self.process = context.Process(target=serve, args=(other, *arguments), daemon=True)
+        self.process.start()
+        other.close()
+        self.building, self.first_frame = self.connection.recv()
+
+    def render(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
+        """An image with footprints of ``spp`` samples per pixel, and the seconds it took."""
+        self.connection.send((spp, seed))
+        return self.connection.recv()
+
+    def close(self) -> None:
+        self.connection.close()
+        self.process.join()
+
+
+def serve(connection, variant: str, *arguments: object) -> None:
+    """What the process of a :class:`Renderer` does until the other end of the connection closes.
+
+    ``arguments``: of :func:`load`.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    mi.set_variant(variant)
+    scene, building = timed(lambda: load(*arguments))
+    connection.send((building, render(scene, 1, 0)[1]))
+    while True:
+        try:
+            spp, seed = connection.recv()
+        except EOFError:
+            return
+        connection.send(render(scene, spp, seed))
+
+
+def load(material: Method | str, surface: Surface, scale: float, settings: Settings) -> mi.Scene:
+    """The scene with a material: a method, or the name of a baseline."""
+    shared = {"material": "Cr", "to_uv": mi.ScalarTransform4f().scale([scale, scale, 1])}
+    if isinstance(material, str):
+        described = BASELINES[material](surface.normal_map, **shared)
+    else:
+        described = material.describe(surface) | shared | {"footprint_sigma": FOOTPRINT_SIGMA}
+    return curved_patch(described, settings.size, 1, LIGHT_RADIUS)
+
+
+def renderers(methods: list[Method], surface: Surface, scale: float, settings: Settings):
+    """A :class:`Renderer` per material, by name, made one after the other."""
+    materials = {name: name for name in BASELINES} | {method.name: method for method in methods}
+    made: dict[str, Renderer] = {}
+    try:
+        for name, material in materials.items():
+            made[name] = Renderer(mi.variant(), material, surface, scale, settings)
+    except BaseException:
+        close(made)
+        raise
+    return made
+
+
+def close(made: dict[str, Renderer]) -> None:
+    """End the processes of renderers."""
+    for renderer in made.values():
+        renderer.close()
+
+
+def truth(surface: Surface, scale: float, settings: Settings):
+    """A unit of the store: the truth, and its noise."""
+    scene = load("brute force", surface, scale, settings)
+    found = reference_render(scene, spp=settings.truth_spp, seed=1000)
+    values = {"samples_per_pixel": settings.truth_spp, "noise": found.relative_error}
+    return values, {"image": found.image, "standard_error": found.standard_error}
+
+
+def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
+    """An image with footprints of ``spp`` samples per pixel, and the seconds of rendering alone."""
+    parameters = mi.traverse(scene)
+    parameters.keep([r".*pixel_spread$"])
+    for key in parameters.keys():
+        # Opaque, so that one kernel serves all numbers of samples.
+        parameters[key] = dr.opaque(mi.Float, pixel_angle(scene.sensors()[0]) / spp**0.5)
+    parameters.update()
+
+    def rendered() -> mi.TensorXf:
+        image = mi.render(scene, spp=spp, seed=seed)
+        dr.eval(image)
+        return image
+
+    image, taken = timed(rendered)
+    return np.array(image)[..., :3].astype(np.float64), taken
+
+
+def measure(made: dict[str, Renderer], reference: Truth, spp: int, settings: Settings):
+    """A unit of the store: all materials at one number of samples, in turn for every seed."""
+    taken, error, mean = ({name: [] for name in made} for _ in range(3))
+    images = {}
+    for renderer in made.values():
+        renderer.render(spp, 0)  # warms up
+    for seed in range(1, settings.seeds + 1):
+        for name, renderer in made.items():
+            image, seconds = renderer.render(spp, seed)
+            images.setdefault(name, image.astype(np.float32))
+            taken[name].append(seconds)
+            error[name].append(reference.relative_rmse(image))
+            mean[name].append(float(image.mean() / reference.image.mean()))
+    points = [
+        {
+            "method": name,
+            "samples_per_pixel": spp,
+            "seconds": float(np.median(taken[name])),
+            "build_seconds": renderer.building,
+            "first_frame_seconds": renderer.first_frame,
+            "mean": float(np.mean(mean[name])),
+            **band(error[name]),
+        }
+        for name, renderer in made.items()
+    ]
+    return {"points": points}, images
+
+
+def band(errors: list[float]) -> dict[str, float]:
+    """Mean over the seeds, and the 95 % interval of this mean by Student's t."""
+    mean, n = float(np.mean(errors)), len(errors)
+    half = float(scipy.stats.t.ppf(0.975, n - 1) * np.std(errors, ddof=1) / n**0.5)
+    return {"rmse": mean, "rmse_low": max(mean - half, 0.0), "rmse_high": mean + half}
+
+
+def at_equal_times(points: list[dict], count: int = 5) -> list[dict]:
+    """Errors of all materials at log-spaced times that at least half of them reach.
+
+    Between budgets error is a power of time; beyond the largest or below the smallest budget of a
+    material there is no figure for it.
+    """
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for point in points:
+        curves.setdefault(point["method"], []).append((point["seconds"], point["rmse"]))
+    arrays = {name: np.array(sorted(curve)).T for name, curve in curves.items()}
+    low = float(np.median([curve[0][0] for curve in arrays.values()]))
+    high = float(np.median([curve[0][-1] for curve in arrays.values()]))
+    rows = []
+    for seconds in np.geomspace(low, high, count):
+        error = {
+            name: float(np.exp(np.interp(np.log(seconds), np.log(t), np.log(e))))
+            for name, (t, e) in arrays.items()
+            if t[0] <= seconds <= t[-1] and (e > 0).all()
+        }
+        rows.append({"seconds": float(seconds), "rmse": error})
+    return rows

@@ -1,0 +1,165 @@
+"""The files of the report: JSON, CSV, pictures, page; and a table of which method when."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from glintbsdf.rendering import replacing
+
+from . import figures, images, page, pareto
+
+#: Of the JSON; ``schema.json`` describes it.
+SCHEMA_VERSION = 1
+
+
+def write(folder: Path, machine: dict, described: dict, found: dict, console: Console) -> dict:
+    """Write everything to ``folder``, print the table, and return what went into the JSON."""
+    report = assemble(machine, described, found)
+    pictures = folder / "figures"
+    pictures.mkdir(exist_ok=True)
+    write_text(folder / "report.json", json.dumps(report, indent=1, ensure_ascii=False) + "\n")
+    write_csv(folder / "pndf.csv", [
+        {"map": unit["map"], "radius": unit["radius"], **point}
+        for unit in report["pndf"] for point in unit["points"]
+    ])  # fmt: skip
+    write_csv(folder / "images.csv", [
+        {"map": case["map"], "scale": case["scale"], **point}
+        for case in report["images"] for point in case["points"]
+    ])  # fmt: skip
+    drawn = draw(pictures, report)
+    write_text(folder / "report.html", page.html(report, drawn, thumbnails(report, found)))
+    Console().print(table(report["which_when"]))
+    console.print(f"{folder / 'report.html'} shows everything.")
+    return report
+
+
+def assemble(machine: dict, described: dict, found: dict) -> dict:
+    """The report as plain values; pictures and page name a point by its ``id``."""
+    rungs = {method["name"]: method["rung"] for method in described["methods"]}
+    units = []
+    for index, (unit, _) in enumerate(found["pndf"]):
+        points = [
+            {"id": f"p{index}-{i}", "rung": rungs[point["method"]], **point}
+            for i, point in enumerate(unit["points"])
+        ]
+        units.append({**unit, "points": points})
+    cases = []
+    for index, (truth, _) in enumerate(found["truths"]):
+        where = {"map": truth["map"], "scale": truth["scale"]}
+        points = [
+            point
+            for unit, _ in found["images"]
+            if {key: unit[key] for key in where} == where
+            for point in unit["points"]
+        ]
+        points = [{"id": f"i{index}-{i}", **point} for i, point in enumerate(points)]
+        cases.append({
+            **where,
+            "truth": {key: truth[key] for key in ("samples_per_pixel", "noise")},
+            "points": points,
+            "at_equal_times": images.at_equal_times(points),
+        })  # fmt: skip
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "machine": machine,
+        **described,
+        "structures": [values for values, _ in found["structures"]],
+        "pndf": units,
+        "images": cases,
+        "grid": found["grid"][0][0],
+        "which_when": pareto.which_when(units),
+    }
+
+
+def of_maps(units: list[dict]) -> dict[str, list[dict]]:
+    """Units by the name of their map."""
+    maps: dict[str, list[dict]] = {}
+    for unit in units:
+        maps.setdefault(unit["map"], []).append(unit)
+    return maps
+
+
+def draw(folder: Path, report: dict) -> dict[str, str]:
+    """All pictures, as SVG by name."""
+    palette = figures.Palette([method["family"] for method in report["methods"]])
+    drawn = {}
+    for name, units in of_maps(report["pndf"]).items():
+        for metric in figures.METRICS:
+            title = f"pndf_{name}_{metric}"
+            drawn[title] = figures.draw(
+                folder, title, figures.errors, units, palette, metric, "seconds_per_query"
+            )
+        title = f"pndf_{name}_memory"
+        drawn[title] = figures.draw(folder, title, figures.errors, units, palette, "l1", "bytes")
+    drawn["pndf_cost"] = figures.draw(
+        folder, "pndf_cost", figures.cost, of_maps(report["pndf"]), palette
+    )
+    for case in report["images"]:
+        title = f"images_{case['map']}_{case['scale']:g}"
+        names = list(dict.fromkeys(point["method"] for point in case["points"]))
+        drawn[title] = figures.draw(
+            folder, title, figures.images, case["points"], case["truth"]["noise"], names
+        )
+    return drawn
+
+
+def thumbnails(report: dict, found: dict) -> dict[str, str]:
+    """Pictures of points as data URIs, by the points' ids; references by the unit's number."""
+    uris = {}
+    for index, (unit, (_, arrays)) in enumerate(zip(report["pndf"], found["pndf"], strict=True)):
+        references = {key: a for key, a in arrays.items() if key.startswith("reference ")}
+        peak = max(a.max() for a in references.values())
+        for key, array in references.items():
+            uris[f"p{index}-{key}"] = page.density_uri(array, peak)
+        for point in unit["points"]:
+            uris[point["id"]] = page.density_uri(arrays[point["method"]], peak)
+    for index, (case, (_, truth)) in enumerate(zip(report["images"], found["truths"], strict=True)):
+        white = page.white_of(truth["image"])
+        uris[f"i{index}-truth"] = page.image_uri(truth["image"], white)
+        where = (case["map"], case["scale"])
+        pictures = {
+            unit["samples_per_pixel"]: arrays
+            for unit, arrays in found["images"]
+            if (unit["map"], unit["scale"]) == where
+        }
+        for point in case["points"]:
+            image = pictures[point["samples_per_pixel"]][point["method"]]
+            uris[point["id"]] = page.image_uri(image, white)
+    return uris
+
+
+def write_text(path: Path, text: str) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def table(rows: list[dict]) -> Table:
+    """The fastest method per map, footprint and tolerated error."""
+    found = Table(title="The fastest method whose relative L1 error is at most …")
+    found.add_column("map")
+    found.add_column("r (texels)", justify="right")
+    for tolerance in pareto.TOLERANCES:
+        found.add_column(f"{tolerance:.0%}")
+    last = None
+    for row in rows:
+        cells = [
+            "–"
+            if cell["method"] is None
+            else f"{cell['method']} ({1e6 * cell['seconds_per_query']:.2g} µs)"
+            for cell in row["fastest"]
+        ]
+        found.add_row(row["map"] if row["map"] != last else "", f"{row['radius']:g}", *cells)
+        last = row["map"]
+    return found

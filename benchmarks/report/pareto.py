@@ -1,0 +1,49 @@
+"""Which method when: fronts of error against time, per map and footprint."""
+
+from __future__ import annotations
+
+#: Errors (relative L1) that one may ask for.
+TOLERANCES = (0.2, 0.1, 0.05, 0.02)
+
+#: An error up to this many times its noise is told from none by no measurement.
+TELLABLE = 1.5
+
+
+def excess(point: dict, metric: str = "l1") -> float:
+    """The error of a point, or 0 where it cannot be told from the noise."""
+    return point[metric] if point[metric] > TELLABLE * point[f"noise_{metric}"] else 0.0
+
+
+def front(points: list[dict], cost: str = "seconds_per_query", metric: str = "l1") -> list[str]:
+    """Names of the methods that no other beats in both cost and error, cheapest first."""
+    found, best = [], float("inf")
+    for point in sorted(points, key=lambda point: (point[cost], excess(point, metric))):
+        if excess(point, metric) < best:
+            best = excess(point, metric)
+            found.append(point["method"])
+    return found
+
+
+def fastest(points: list[dict], tolerance: float) -> dict | None:
+    """The fastest point whose error is at most ``tolerance``, or None."""
+    allowed = [point for point in points if excess(point) <= tolerance]
+    return min(allowed, key=lambda point: point["seconds_per_query"], default=None)
+
+
+def which_when(units: list[dict]) -> list[dict]:
+    """One row per map and footprint: the front, and the fastest method for each tolerance."""
+    rows = []
+    for unit in units:
+        row = {"map": unit["map"], "radius": unit["radius"], "front": front(unit["points"])}
+        row["fastest"] = []
+        for tolerance in TOLERANCES:
+            point = fastest(unit["points"], tolerance)
+            row["fastest"].append(
+                {
+                    "tolerance": tolerance,
+                    "method": None if point is None else point["method"],
+                    "seconds_per_query": None if point is None else point["seconds_per_query"],
+                }
+            )
+        rows.append(row)
+    return rows

@@ -1,0 +1,281 @@
+"""The P-NDF level: error against the binned reference, time per query, memory, building."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf import NormalMap
+from glintbsdf.footprint import Footprint
+from glintbsdf.pndf import Manifold
+from glintbsdf.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
+
+from .methods import EXACT, SIGMA_R, Method, Surface
+
+#: Queries of the first call, which compiles, and of the one that says how long a batch shall be.
+FEW = 256
+
+#: Most queries of a batch.
+MOST = 2**18
+
+#: Seconds of evaluation beyond which fewer points per bin have to do.
+PATIENCE = 15.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the P-NDF level is measured.
+
+    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``points``
+    per bin and axis; ``batch`` the seconds of a timed batch.
+    """
+
+    size: int
+    radii: tuple[float, ...]
+    places: tuple[tuple[float, float], ...]
+    res: int
+    samples: int
+    points: int
+    repetitions: int
+    batch: float
+
+
+def build(method: Method, surface: Surface):
+    """The estimator of a method. Without masking, which is no part of a P-NDF."""
+    parameters = {"masking": "none"}
+    if method.plugin["type"] == "glint_manifold":
+        parameters["epsilon"] = surface.epsilon
+    return mi.load_dict({**method.describe(surface), **parameters}).pndf
+
+
+def structure(method: Method, surface: Surface, with_compiling: bool):
+    """The estimator, and the seconds to build it, its memory, and the seconds to compile it.
+
+    Nothing comes from the cache on disk. Compiling, of the code that builds and of that of the
+    first query, is what takes longer the first time, with Dr.Jit's own cache emptied; None where
+    it is not asked for, as it hardly depends on the map.
+    """
+    m, footprint = queries(surface.normal_map, 16.0, FEW)
+    compiling = None
+    if with_compiling:
+        forget_kernels()
+        pndf, cold = timed(lambda: build(method, surface))
+        cold += seconds(pndf, m, footprint)
+    pndf, building = timed(lambda: build(method, surface))
+    if with_compiling:
+        seconds(pndf, m, footprint)
+        compiling = max(cold - building - seconds(pndf, m, footprint), 0.0)
+    return pndf, {
+        "build_seconds": building,
+        "compile_seconds": compiling,
+        "bytes": int(pndf.nbytes),
+    }
+
+
+def timed(action):
+    """What an action returns, and the seconds it took, all kernels done."""
+    dr.sync_thread()
+    start = time.perf_counter()
+    result = action()
+    dr.sync_thread()
+    return result, time.perf_counter() - start
+
+
+def forget_kernels() -> None:
+    """Make Dr.Jit compile again what it has compiled before."""
+    dr.flush_kernel_cache()
+    folder = os.environ["DRJIT_CACHE_DIR"]
+    shutil.rmtree(folder, ignore_errors=True)
+    os.makedirs(folder)
+
+
+def seconds(pndf, m, footprint) -> float:
+    """Wall-clock time of evaluating one batch."""
+    return timed(lambda: dr.eval(pndf.eval(m, footprint)))[1]
+
+
+def texel_footprint(normal_map: NormalMap, uv: np.ndarray, sigma: float) -> Footprint:
+    """Round footprints of ``sigma`` texels at ``uv``, 2×N: as many lanes as places."""
+    u, v = (dr.opaque(mi.Float, sigma / n) for n in (normal_map.width, normal_map.height))
+    centre = mi.Point2f(*(mi.Float(np.float32(x)) for x in uv))
+    return Footprint(centre, mi.Vector2f(u, 0), mi.Vector2f(0, v))
+
+
+def queries(normal_map: NormalMap, radius: float, count: int):
+    """Random places on the map, each with a normal drawn from its own exact P-NDF.
+
+    So a BSDF's samples ask; light sampling asks for other normals too, where D is often 0.
+    """
+    uv, u = np.random.default_rng(7).random((2, 2, count), dtype=np.float32)
+    footprint = texel_footprint(normal_map, uv, radius / 3)
+    m = Manifold(normal_map).sample(footprint, 0.0, mi.Point2f(u))
+    dr.eval(m, footprint.uv)
+    return m, footprint
+
+
+def first(count: int, m, footprint):
+    """The first of many queries."""
+    index = dr.arange(mi.UInt32, count)
+    part = type(footprint)(dr.gather(mi.Point2f, footprint.uv, index), footprint.du, footprint.dv)
+    m = dr.gather(mi.Vector2f, m, index)
+    dr.eval(m, part.uv)
+    return m, part
+
+
+# ------------------------------------------------------------------------------------------------
+#  One footprint size of one map: all methods
+# ------------------------------------------------------------------------------------------------
+
+
+def measure(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
+    """A unit of the store: errors and times of all methods under footprints of one size."""
+    per_query, ratios = times(structures, surface.normal_map, radius, settings)
+    # One grid of bins for all, as wide as the roughest needs.
+    rough = any(roughness(pndf) > 0 for pndf in structures.values())
+    bounds = normal_bounds(surface.normal_map, surface.epsilon, SIGMA_R if rough else 0.0)
+    nothing = np.zeros((settings.res, settings.res))
+    results = {method: [] for method in structures}
+    floors: dict[float, list[dict]] = {}
+    pictures = {}
+    for place in settings.places:
+        references: dict[float, BinnedPNDF] = {}
+        for method, pndf in structures.items():
+            sigma_r = roughness(pndf)
+            if sigma_r not in references:
+                references[sigma_r] = binned_pndf(
+                    surface.normal_map,
+                    place,
+                    texel_covariance(surface.normal_map, radius / 3),
+                    epsilon=surface.epsilon,
+                    sigma_r=sigma_r,
+                    res=settings.res,
+                    bounds=bounds,
+                    samples=settings.samples,
+                )
+                floors.setdefault(sigma_r, []).append(noise(references[sigma_r], nothing))
+                pictures.setdefault(
+                    f"reference {sigma_r:g}", references[sigma_r].density.astype(np.float32)
+                )
+            points = settings.points
+            while points > 2 and per_query[method] * (settings.res * points) ** 2 > PATIENCE:
+                points //= 2
+            density, deviation = in_bins(
+                pndf, surface.normal_map, place, radius, bounds, settings.res, points
+            )
+            pictures.setdefault(method.name, density.astype(np.float32))
+            own_noise = noise(references[sigma_r], deviation)
+            results[method].append(
+                errors(references[sigma_r], density)
+                | {f"noise_{name}": value for name, value in own_noise.items()}
+            )
+    return {
+        "map": surface.name,
+        "radius": radius,
+        "noise_floor": {f"{sigma_r:g}": mean_of(rows) for sigma_r, rows in floors.items()},
+        "points": [
+            {
+                "method": method.name,
+                "family": method.family,
+                "setting": method.setting,
+                "sigma_r": roughness(pndf),
+                "bytes": int(pndf.nbytes),
+                "seconds_per_query": per_query[method],
+                "times_faster_than_exact": ratios[method],
+                **mean_of(results[method]),
+            }
+            for method, pndf in structures.items()
+        ],
+    }, pictures
+
+
+def roughness(pndf) -> float:
+    """σ_r that a P-NDF has besides the map's normals."""
+    alpha = getattr(pndf, "alpha", None)
+    if alpha is not None:  # a filter's: α² = 2σ²
+        return round(float(alpha[0]) / 2**0.5, 9)
+    return round(float(np.ravel(getattr(pndf, "sigma_r", 0.0))[0]), 9)
+
+
+def in_bins(pndf, normal_map, place, radius, bounds, res, points):
+    """Mean of D over every bin of the reference, and its standard error, by jittered points."""
+    (x_min, y_min), (x_max, y_max) = bounds
+    n = res * points
+    row, column = (np.indices((n, n)) + np.random.default_rng(0).random((2, n, n))) / n
+    m = mi.Vector2f(
+        mi.Float(np.float32(x_min + (x_max - x_min) * column).ravel()),
+        mi.Float(np.float32(y_min + (y_max - y_min) * row).ravel()),
+    )
+    uv = np.repeat(np.array(place)[:, None], n * n, axis=1)
+    density = pndf.eval(m, texel_footprint(normal_map, uv, radius / 3)).numpy()
+    split = density.reshape(res, points, res, points)
+    mean = split.mean(axis=(1, 3), dtype=np.float64)
+    # Stratified points have less noise than this.
+    return mean, split.std(axis=(1, 3), dtype=np.float64, ddof=1) / points
+
+
+def errors(reference: BinnedPNDF, density: np.ndarray) -> dict[str, float]:
+    """Relative L1, L2 and maximum difference to a reference."""
+    return norms(np.abs(density - reference.density), reference)
+
+
+def norms(difference: np.ndarray, reference: BinnedPNDF) -> dict[str, float]:
+    truth = reference.density
+    return {
+        "l1": float(difference.sum() / truth.sum()),
+        "l2": float(np.sqrt((difference**2).sum() / (truth**2).sum())),
+        "maximum": float(difference.max() / truth.max()),
+    }
+
+
+def noise(reference: BinnedPNDF, deviation: np.ndarray) -> dict[str, float]:
+    """What :func:`errors` an exact density would show, from the noise of both grids, in the mean.
+
+    ``deviation`` is the standard error of the density. Bins in which the reference has found
+    nothing are left out, as in :attr:`BinnedPNDF.noise_floor`.
+    """
+    own = np.where(reference.density > 0, reference.standard_error, 0)
+    total = np.hypot(own, deviation)
+    draws = np.random.default_rng(0).standard_normal((16, *total.shape))
+    return mean_of([norms(np.abs(total * draw), reference) for draw in draws])
+
+
+def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def times(structures: dict[Method, object], normal_map, radius, settings):
+    """Median seconds per query of every method, and how many times faster than exact it is.
+
+    One thread. All methods in turn within every repetition, after a warm-up that compiles and says
+    how many queries make a batch.
+    """
+    many = queries(normal_map, radius, MOST)
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        batches = {}
+        for method, pndf in structures.items():
+            few = first(FEW, *many)
+            taken = min(seconds(pndf, *few) for _ in range(2))
+            count = int(np.clip(FEW * settings.batch / taken, FEW, MOST)) // 8 * 8
+            batches[method] = (pndf, *first(count, *many))
+        taken = {method: [] for method in batches}
+        for _ in range(settings.repetitions):
+            for method, (pndf, m, footprint) in batches.items():
+                taken[method].append(seconds(pndf, m, footprint) / dr.width(m))
+    finally:
+        dr.set_thread_count(threads)
+    exact = next((taken[method] for method in taken if method.name == EXACT.name), None)
+    return (
+        {method: float(np.median(values)) for method, values in taken.items()},
+        {
+            method: None if exact is None else float(np.median(np.divide(exact, values)))
+            for method, values in taken.items()
+        },
+    )
