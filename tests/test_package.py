@@ -35,13 +35,27 @@ def test_import_is_light_and_chooses_no_variant():
     assert output[0] == "None"
     heavy = {"numpy", "scipy", "skimage", "OpenEXR", "click", "rich", "matplotlib", "platformdirs"}
     assert not heavy & set(output)
+    own = {name for name in output if name.startswith("glintbsdf")}
+    assert own == {"glintbsdf", "glintbsdf.llvm", "glintbsdf.registration"}
 
 
 def test_choosing_a_variant_loads_no_image_or_plotting_library(variant):
     output = python(
         f"import sys, glintbsdf, mitsuba; mitsuba.set_variant('{variant}'); print(*sys.modules)"
     )
-    assert not {"skimage", "OpenEXR", "click", "rich", "matplotlib"} & set(output.split())
+    assert not {"skimage", "OpenEXR", "click", "rich", "matplotlib", "scipy"} & set(output.split())
+
+
+def test_a_bsdf_loads_what_reads_its_file_and_no_more(variant, tmp_path):
+    """A map given as data needs no reader; what only some plugins need is not there either."""
+    output = python(
+        f"import sys, glintbsdf, mitsuba as mi; mi.set_variant('{variant}')\n"
+        "data = mi.TensorXf([0.1] * 128, (8, 8, 2))\n"
+        "mi.load_dict({'type': 'glint_manifold', 'data': data, 'max_error': 0})\n"
+        "mi.load_dict({'type': 'glint_filtered', 'data': data})\n"
+        "print(*sys.modules)"
+    )
+    assert not {"skimage", "OpenEXR", "click", "rich", "matplotlib", "scipy"} & set(output.split())
 
 
 @pytest.mark.parametrize("name", glintbsdf.__all__)

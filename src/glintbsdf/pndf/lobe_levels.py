@@ -23,7 +23,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from ..gaussian_lobes import SIGMA_H
 from ..progress import progress
@@ -145,6 +144,8 @@ class Clustering:
         if count <= self.clusters:
             return np.arange(count)
         begin = features[self.rng.choice(count, self.clusters, replace=False)]
+        from scipy.cluster.vq import kmeans2  # half a second that only those pay who build
+
         return kmeans2(features, begin, iter=ITERATIONS, minit="matrix")[1]
 
 
