@@ -180,6 +180,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 si.compute_uv_partials(ray_)
                 si.duv_dx = dr.select(depth == 0, si.duv_dx, duv_dx)
                 si.duv_dy = dr.select(depth == 0, si.duv_dy, duv_dy)
+                # Where a path ends nothing is reflected, and a wide footprint would be costly
+                si.duv_dx = dr.select(active_next, si.duv_dx, 0)
+                si.duv_dy = dr.select(active_next, si.duv_dy, 0)
 
             # ---------------------- Emitter sampling ----------------------
 
