@@ -173,7 +173,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.microfacet import MapBeckmannMasking
+from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import Elements
 
@@ -194,6 +194,7 @@ class GlintElements(GlintBSDF):
         )
         masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
         self.masking = MapBeckmannMasking(self.pndf) if masking == "beckmann" else None
+        self.smooth = MapBeckmannLobe(self.pndf)
 
 
 mi.register_bsdf("glint_elements", lambda props: GlintElements(props))

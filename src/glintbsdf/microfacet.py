@@ -335,12 +335,14 @@ class BeckmannLobe:
 class MapBeckmannLobe(BeckmannLobe):
     """The smooth surface as rough as a whole map: what its glints add up to, from afar.
 
-    The roughness is that of :class:`MapBeckmannMasking`: twice the mean squared slope along u and
-    along v. A tilt of the map as a whole counts as roughness, and the two axes as uncorrelated. A
-    flat map has the smallest roughness, 1e-4.
+    The squared roughness is that of :class:`MapBeckmannMasking`, twice the mean squared slope along
+    u and along v, plus 2σ_r² for the intrinsic roughness of elements and lobes. A tilt of the map as
+    a whole counts as roughness, and the two axes as uncorrelated. A flat map has the smallest
+    roughness, 1e-4.
 
     Args:
-        pndf: the P-NDF whose map ``pndf.data`` (H×W×2 projected normals) gives the roughness.
+        pndf: the P-NDF whose map ``pndf.data`` (H×W×2 projected normals) gives the roughness, and
+            ``pndf.sigma_r``, if it has one, the intrinsic roughness.
     """
 
     def __init__(self, pndf: object) -> None:
@@ -348,7 +350,9 @@ class MapBeckmannLobe(BeckmannLobe):
         self.parameters_changed()
 
     def parameters_changed(self) -> None:
-        super().__init__(dr.sqrt(dr.maximum(map_alpha_squared(self.pndf.data), 1e-8)))
+        intrinsic = 2 * dr.square(getattr(self.pndf, "sigma_r", 0.0))
+        alpha_squared = map_alpha_squared(self.pndf.data) + intrinsic
+        super().__init__(dr.sqrt(dr.maximum(alpha_squared, 1e-8)))
 
 
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
