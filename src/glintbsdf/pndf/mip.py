@@ -188,7 +188,8 @@ class Mip:
         """Call ``state = add(state, lobe, d, sign, active)`` for all lobes that count.
 
         ``d`` (texels) is the footprint's centre as seen from the lobe, in the lobe's own frame,
-        whose axes a mirrored map flips: ``sign``. One flat loop: a lobe a turn.
+        whose axes a mirrored map flips: ``sign``. One flat loop: a lobe a turn. What is not summed
+        is whole numbers: Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
         """
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
@@ -226,13 +227,13 @@ class Mip:
             first, count, first_2, count_2 = grids.run(
                 level, rows, columns, row, column, flipped_x, inside
             )
-            origin = mi.Vector2f(
+            origin = mi.Vector2i(
                 columns.placed(columns.origin(column), turn_x, flipped_x),
                 rows.placed(rows.origin(row), turn_y, flipped_y),
             )
             if mirrored:
-                sign = mi.Vector2f(dr.select(flipped_x, -1, 1), dr.select(flipped_y, -1, 1))
-            # Texels of a run are grids of their own
+                sign = mi.Vector2i(dr.select(flipped_x, -1, 1), dr.select(flipped_y, -1, 1))
+            # Texels of a run are grids of their own.
             count = dr.select(texels, dr.minimum(count, mi.UInt32(right - x + 1)), count)
             x = dr.select(texels, x + mi.Int(count) - 1, x)
             return first, count, first_2, count_2, y, x, right, origin, sign
@@ -256,10 +257,12 @@ class Mip:
             )
             first, count, first_2, count_2, y, x, right, origin, sign = walk
             inside = active & (y <= bottom) & (count > 0)
-            lobe = Lobe(self.words, first, extent, *self.seen(kernel, sign), inside)
-            state = add(state, lobe, (mean - origin) * sign - lobe.position, sign, inside)
+            axes = mi.Vector2f(sign)
+            lobe = Lobe(self.words, first, extent, *self.seen(kernel, axes), inside)
+            d = (mean - mi.Vector2f(origin)) * axes - lobe.position
+            state = add(state, lobe, d, axes, inside)
             count = dr.select(inside, count - 1, count)
-            origin = mi.Vector2f(dr.select(texels, origin.x + 1, origin.x), origin.y)
+            origin = mi.Vector2i(dr.select(texels, origin.x + 1, origin.x), origin.y)
             return state, (first + 1, count, first_2, count_2, y, x, right, origin, sign)
 
         walk = (
@@ -267,8 +270,8 @@ class Mip:
             top - 1,
             mi.Int(0),
             mi.Int(-1),
-            mi.Vector2f(0),
-            mi.Vector2f(1),
+            mi.Vector2i(0),
+            mi.Vector2i(1),
         )
         state, _ = dr.while_loop(
             (state, walk),

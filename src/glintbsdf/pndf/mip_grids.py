@@ -98,16 +98,16 @@ class AxisLevel:
         offset = mi.Float(part) * self.axis.inner / mi.Float(1 << self.split)
         return dr.select(self.texels, mi.Float(index), mi.Float(start) + offset)
 
-    def origin(self, index: mi.UInt32) -> mi.Float:
-        """Where positions of the lobes of a stored grid count from: its cell, or first cell."""
+    def origin(self, index: mi.UInt32) -> mi.Int:
+        """Texel from which positions of the lobes of a stored grid count: its first cell's."""
         cell = (index >> self.split) << self.joined
         start = dr.gather(mi.UInt32, self.axis.starts, cell, self.active & ~self.texels)
-        return mi.Float(dr.select(self.texels, index, start))
+        return mi.Int(dr.select(self.texels, index, start))
 
-    def placed(self, x: mi.Float, turn: mi.Int, flipped: mi.Bool) -> mi.Float:
+    def placed(self, x: mi.Float | mi.Int, turn: mi.Int, flipped: mi.Bool) -> mi.Float | mi.Int:
         """The position of a stored one in a copy of the map."""
         x = dr.select(flipped, self.axis.size - x, x)
-        return x + mi.Float(turn * self.axis.size)
+        return x + type(x)(turn * self.axis.size)
 
 
 class Grids:
