@@ -192,3 +192,30 @@ def test_derivative_of_a_sample(variant):
             for s in (step, -step)
         )
         assert np.isclose(dr.grad(z)[0], (plus - minus) / (2 * step), rtol=1e-2)
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+@pytest.mark.parametrize("turned", [False, True])
+def test_thin_lobes_keep_their_digits(variant, distribution, turned):
+    # Two planes that meet under the footprint: all slopes on a line, and a roughness of 1e-4.
+    alpha, line = 1e-4, np.array([0.9, 0.1][:: -1 if turned else 1])
+    uu, vv, uv = (*(alpha**2 + line**2), line[0] * line[1])
+    determinant = alpha**2 * (alpha**2 + (line**2).sum())
+    lobe = SlopeLobe(
+        mi.Vector2f(0), *(mi.Float(x) for x in (uu, vv, uv, determinant)), distribution
+    )
+    along, across = np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9))
+    normal = np.array([-line[1], line[0]]) / np.linalg.norm(line)
+    x = along[..., None] * line + across[..., None] * alpha * normal
+    s = np.float32(x / np.sqrt(1 + (x**2).sum(-1, keepdims=True)))
+    value = np.array(lobe.eval(mi.Vector2f(*(mi.Float(c.ravel()) for c in np.moveaxis(s, -1, 0)))))
+    distance = along**2 + across**2  # but for terms of alpha²
+    shape = np.exp(-distance) if distribution == "beckmann" else 1 / (1 + distance) ** 2
+    expected = shape * (1 + (x**2).sum(-1)) ** 2 / (np.pi * np.sqrt(determinant))
+    # Normals and the direction of the line are rounded to 6e-8: 6e-4 of the width, twice.
+    assert np.allclose(value, expected.ravel(), rtol=5e-3)
+    u = random_numbers(1000, 3, seed=2)
+    for w in (mi.Vector3f(0, 0, 1), mi.Vector3f(0.6, 0, 0.8), dr.normalize(mi.Vector3f(1, -9, 1))):
+        m = np.array(lobe.sample_visible(w, u[0], mi.Point2f(u[1], u[2])))
+        assert np.isfinite(m).all()
+        assert np.median(np.abs(normal @ (m[:2] / m[2]))) < alpha  # GGX has wide tails

@@ -26,6 +26,8 @@ from math import pi, sqrt
 import drjit as dr
 import mitsuba as mi
 
+from .kernels import difference_of_products
+
 DISTRIBUTIONS = ("beckmann", "ggx")
 
 #: A Gaussian this many standard deviations away from zero counts as on one side of it: facets of a
@@ -91,6 +93,13 @@ class SlopeLobe:
     ) -> None:
         self.mean, self.determinant, self.distribution = mean, determinant, distribution
         self.uu, self.vv, self.uv = uu, vv, uv
+        # Ω = f fᵀ + g gᵀ, Cholesky's factors with the larger diagonal entry first: quadratic forms
+        # are sums of squares, which stay positive, and as precise as |Ω|, however thin the lobe.
+        u_first = uu >= vv
+        first = dr.sqrt(dr.select(u_first, uu, vv))
+        second, third = uv / first, dr.sqrt(determinant) / first
+        self.f = dr.select(u_first, mi.Vector2f(first, second), mi.Vector2f(second, first))
+        self.g = dr.select(u_first, mi.Vector2f(0, third), mi.Vector2f(third, 0))
 
     def eval(self, s: mi.Vector2f) -> mi.Float:
         """D of the projected normal s: density over the disk; 0 outside."""
@@ -98,10 +107,9 @@ class SlopeLobe:
         inside = z_squared > 0
         z_squared = dr.select(inside, z_squared, 1)
         d = s * dr.rsqrt(z_squared) - self.mean
-        distance = (
-            dr.fma(self.vv, d.x * d.x, dr.fma(self.uu, d.y * d.y, -2 * self.uv * d.x * d.y))
-            / self.determinant
-        )
+        # d = t f + τ g, and dᵀ Ω⁻¹ d = t² + τ².
+        t, tau = (difference_of_products(d.x, v.y, d.y, v.x) for v in (self.g, self.f))
+        distance = dr.fma(t, t, tau * tau) / self.determinant
         if self.distribution == "beckmann":
             shape = dr.exp(-distance)
         else:
@@ -116,7 +124,8 @@ class SlopeLobe:
 
     def width_squared(self, w: mi.Vector3f) -> mi.Float:
         """Z²."""
-        return dr.fma(self.uu, w.x * w.x, dr.fma(self.vv, w.y * w.y, 2 * self.uv * w.x * w.y))
+        along_f, along_g = (dr.fma(w.x, v.x, w.y * v.y) for v in (self.f, self.g))
+        return dr.fma(along_f, along_f, along_g * along_g)
 
     # --------------------------------------------------------------------------------------------
     #  Visible normals
@@ -154,7 +163,7 @@ class SlopeLobe:
         e = dr.select(tilted, w.xy / dr.select(tilted, length, 1), mi.Vector2f(1, 0))
         across = mi.Vector2f(-e.y, e.x)
         variance = 0.5 * self.width_squared(mi.Vector3f(e.x, e.y, 0))
-        covariance = 0.5 * (dr.fma(self.vv - self.uu, e.x * e.y, self.uv * (e.x * e.x - e.y * e.y)))
+        covariance = 0.5 * sum(dr.dot(e, v) * dr.dot(across, v) for v in (self.f, self.g))
         sigma = dr.sqrt(variance)
         a = self.mean_cosine(w) / dr.maximum(length * sigma, 1e-6)
         z = sample_positive_part(dr.clip(a, -FAR, 1e6), sample1, sample2.x)
@@ -168,21 +177,15 @@ class SlopeLobe:
 
     def sample_visible_ggx(self, w: mi.Vector3f, sample: mi.Point2f) -> mi.Vector3f:
         """A hemisphere of mirrors, seen from above or below, reflects evenly into a cap."""
-        # Ω = L Lᵀ takes the slopes of the hemisphere to those of the lobe.
-        l11 = dr.sqrt(self.uu)
-        l21, l22 = self.uv / l11, dr.sqrt(self.determinant) / l11
-        wi = dr.normalize(mi.Vector3f(l11 * w.x + l21 * w.y, l22 * w.y, self.mean_cosine(w)))
+        # Ω = [f g] [f g]ᵀ takes the slopes of the hemisphere to those of the lobe.
+        along_f, along_g = (dr.fma(w.x, v.x, w.y * v.y) for v in (self.f, self.g))
+        wi = dr.normalize(mi.Vector3f(along_f, along_g, self.mean_cosine(w)))
         sin_phi, cos_phi = dr.sincos(2 * pi * sample.x)
         z = dr.fma(1 - sample.y, 1 + wi.z, -wi.z)
         sin_theta = dr.safe_sqrt(1 - z * z)
         h = wi + mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, z)
-        return dr.normalize(
-            mi.Vector3f(
-                dr.fma(self.mean.x, h.z, l11 * h.x),
-                dr.fma(self.mean.y, h.z, l21 * h.x + l22 * h.y),
-                h.z,
-            )
-        )
+        slope = self.mean * h.z + self.f * h.x + self.g * h.y
+        return dr.normalize(mi.Vector3f(slope.x, slope.y, h.z))
 
 
 #: The largest number below 1 in float32: keeps erfinv finite.
