@@ -12,9 +12,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 
-from glintbsdf import cli, rendering
+from glintbsdf import NormalMap, cli, maps, rendering
 
 SCENE = """<scene version="3.0.0">
     <default name="size" value="16"/>
@@ -360,6 +361,47 @@ def test_pndf_errors(run, folder, extra, message):
 # ---------------------------------------------------------------------------------------------
 #  Messages
 # ---------------------------------------------------------------------------------------------
+
+
+# ---------------------------------------------------------------------------------------------
+#  synthesise
+# ---------------------------------------------------------------------------------------------
+
+
+def test_synthesise_writes_the_map_of_glint_mip(run, folder, variant):
+    sample = maps.isotropic(40, seed=1)
+    channels = np.dstack((sample.normals, np.sqrt(1 - (sample.normals**2).sum(axis=2))))
+    OpenEXR.File({}, {"RGB": channels}).write("sample.exr")
+    sizes = ("--output-size", 100, "--patch-size", 20, "--seed", 3)
+    status, output, errors = run("synthesise", "sample.exr", "-o", "large.exr", *sizes)
+    assert (status, errors) == (0, "")
+    mi.set_variant(variant)  # the folder has left another
+    assert output.startswith("40×40 texels made 100×100") and output.endswith("large.exr\n")
+    bsdf = mi.load_dict(
+        {
+            "type": "glint_mip",
+            "filename": "sample.exr",
+            "output_size": 100,
+            "patch_size": 20,
+            "seed": 3,
+        }
+    )
+    large = NormalMap.load("large.exr").normals
+    assert np.allclose(large, bsdf.pndf.normal_map.normals, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-o", "large.png"), "must end in .exr"),
+        (("-o", "large.exr", "--patch-size", "9999"), 'synthesise: "patch_size" must be'),
+    ],
+)
+def test_synthesise_errors(run, folder, arguments, message):
+    OpenEXR.File({}, {"Y": np.zeros((40, 40), np.float32)}).write("sample.exr")
+    status, output, errors = run("synthesise", "sample.exr", *arguments)
+    assert status != 0 and output == "" and message in errors and errors.count("\n") == 1
+    assert not list(Path().glob("large*"))
 
 
 def test_errors_of_python_plugins_lose_their_traceback():

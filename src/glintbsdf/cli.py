@@ -1,4 +1,4 @@
-"""The command line: ``glintbsdf render``, ``pndf`` and ``doctor``.
+"""The command line: ``glintbsdf render``, ``pndf``, ``synthesise`` and ``doctor``.
 
 Only what concerns the terminal is here; the work is done in other modules.
 """
@@ -17,8 +17,9 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, llvm, pndf_plot, rendering
+from . import __version__, llvm, pndf_plot, rendering, synthesis
 from .doctor import examine
+from .normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from .progress import progress
 
 Definitions = tuple[str, ...]
@@ -129,6 +130,13 @@ def _parse_output(
     if path is not None and path.suffix.lower() not in rendering.FORMATS:
         allowed = " or ".join(rendering.FORMATS)
         raise click.BadParameter(f'must end in {allowed} (got "{path}")')
+    return path
+
+
+def _parse_exr(_context: click.Context, _parameter: click.Parameter, path: Path) -> Path:
+    """Accept only names of OpenEXR files."""
+    if path.suffix.lower() != ".exr":
+        raise click.BadParameter(f'must end in .exr (got "{path}")')
     return path
 
 
@@ -253,6 +261,56 @@ def pndf(
         comparison = pndf_plot.compare(plugin, map_file, uv, sigma, res, definitions)
         rendering.save(comparison.drawing(), unfinished)
     click.echo(comparison)
+    click.echo(output)
+
+
+@commands.command()
+@click.argument("sample", type=_file)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_exr,
+    required=True,
+    help="Map to write, .exr.",
+)
+@click.option("--output-size", type=int, default=4096, show_default=True, help="Its texels.")
+@click.option("--patch-size", type=int, default=64, show_default=True, help="Texels of a patch.")
+@click.option("--overlap", type=int, default=2, show_default=True, help="Texels patches share.")
+@click.option(
+    "--balance",
+    type=float,
+    default=0.9,
+    show_default=True,
+    help="Weight of normals against their Jacobians.",
+)
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--wrap-mode",
+    type=click.Choice(WRAP_MODES),
+    default="repeat",
+    show_default=True,
+    help="To repeat, the map is made to fit to itself.",
+)
+@click.option("--map-type", type=click.Choice(MAP_TYPES), default="auto", show_default=True)
+@click.option("--height-scale", type=float, default=1.0, show_default=True)
+def synthesise(
+    sample: Path,
+    output: Path,
+    wrap_mode: str,
+    map_type: str,
+    height_scale: float,
+    **options: float,
+) -> None:
+    """Make a large normal map from the small normal or height map SAMPLE.
+
+    It is the map of glint_mip with the same parameters, which does not need it to be stored.
+    """
+    normal_map = NormalMap.load(sample, map_type, height_scale, wrap_mode, "synthesise")
+    with rendering.replacing(output) as unfinished:
+        made = synthesis.synthesise(normal_map, **options, toroidal=wrap_mode == "repeat")
+        made.write(unfinished)
+    click.echo(made)
     click.echo(output)
 
 
