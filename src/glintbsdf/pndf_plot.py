@@ -99,6 +99,7 @@ def compare(
         texel_covariance(normal_map, sigma),
         kernel=pndf.kernel,
         epsilon=pndf.epsilon,
+        sigma_r=pndf.sigma_r[0] if hasattr(pndf, "sigma_r") else 0.0,
         res=res,
         samples=samples_per_bin * res * res,
     )
