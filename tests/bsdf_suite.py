@@ -69,6 +69,7 @@ EXTREME_VIEWS = {
     "oblique": View(du=(0.02, 0), dv=(0, 0.02), wi=(1, 0.3, 1)),
     "grazing": View(du=(0.02, 0), dv=(0, 0.02), wi=(1, 0, 1e-3)),
     "almost_horizontal": View(du=(0.02, 0), dv=(0, 0.02), wi=(0, 1, 1e-7)),
+    "horizontal": View(du=(0.02, 0), dv=(0, 0.02), wi=(0, 1, 0)),
 }
 
 
@@ -128,14 +129,11 @@ def mass_in_bins(
 # --------------------------------------------------------------------------------------------------
 
 
-def assert_distributed(
-    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, test_count: int
-) -> None:
-    """Pearson's χ² test of ``counts`` in bins, out of ``total``, against the ``mass`` of each bin.
+def p_value(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray) -> float:
+    """Of Pearson's χ² test of ``counts`` in bins, out of ``total``, against the ``mass`` of each.
 
     What the quadrature errs (``error``, a standard deviation) adds to the variance of a count. The
-    emptiest bins are taken together until they hold five expected counts. The significance of one
-    test is :data:`SIGNIFICANCE` after Šidák's correction for ``test_count`` tests.
+    emptiest bins are taken together until they hold five expected counts.
     """
     order = np.argsort(mass, axis=None)
     counts, expected = counts.ravel()[order], total * mass.ravel()[order]
@@ -145,10 +143,18 @@ def assert_distributed(
         np.append(x[pooled:], x[:pooled].sum()) for x in (counts, expected, variance)
     )
     statistic = ((counts - expected) ** 2 / variance).sum()
-    p_value = scipy.stats.chi2.sf(statistic, len(counts))
-    assert p_value > 1 - (1 - SIGNIFICANCE) ** (1 / test_count), (
-        f"chi2 = {statistic} for {len(counts)} bins, p = {p_value}"
-    )
+    return float(scipy.stats.chi2.sf(statistic, len(counts)))
+
+
+def assert_distributed(
+    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, test_count: int
+) -> None:
+    """The test of :func:`p_value`, as one of ``test_count``.
+
+    The significance of one is :data:`SIGNIFICANCE` after Šidák's correction for them all.
+    """
+    p = p_value(counts, total, mass, error)
+    assert p > 1 - (1 - SIGNIFICANCE) ** (1 / test_count), p
 
 
 def check_chi2(

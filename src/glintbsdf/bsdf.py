@@ -198,20 +198,22 @@ class GlintBSDF(FootprintBSDF):
         active: mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         bs = dr.zeros(mi.BSDFSample3f)
-        cos_theta_i = mi.Frame3f.cos_theta(si.wi)
-        active = mi.Bool(active) & (cos_theta_i > 0)
+        active = mi.Bool(active) & (mi.Frame3f.cos_theta(si.wi) > 0)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
             return bs, mi.Spectrum(0)
+
+        # Lanes below the horizon draw a harmless normal for the vertical: they stay numbers.
+        wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
 
         # Draw a normal and reflect about it. One that does not point up, or reflects below the
         # horizon, is an invalid sample: its mass is missing from the pdf as well.
         footprint = self.footprint(si)
         facets = self.facets(ctx)
-        m = facets.normals.sample(si.wi, footprint, sample1, sample2, active)
-        wo = mi.reflect(si.wi, mi.Normal3f(m))
+        m = facets.normals.sample(wi, footprint, sample1, sample2, active)
+        wo = mi.reflect(wi, mi.Normal3f(m))
         active &= (m.z > 0) & (mi.Frame3f.cos_theta(wo) > 0)
         density = facets.density(si, m, footprint, active)
-        pdf = facets.normals.pdf(si.wi, m, density, footprint, active)
+        pdf = facets.normals.pdf(wi, m, density, footprint, active)
         active &= pdf > 0
 
         bs.wo = wo
@@ -220,9 +222,9 @@ class GlintBSDF(FootprintBSDF):
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         bs.sampled_component = 0
 
-        value = microfacet.reflected_value(density, dr.select(active, cos_theta_i, 1))
+        value = microfacet.reflected_value(density, wi.z)
         weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
-        return bs, self.reflected(weight, facets, ctx, si, si.wi, wo, m, footprint, active)
+        return bs, self.reflected(weight, facets, ctx, si, wi, wo, m, footprint, active)
 
     def eval_pdf(
         self,
