@@ -110,7 +110,7 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
    - |exposed|, |differentiable|
 
 The glints of a surface whose normals come from a high-resolution map, or from metallic flakes. As
-in :cite:`Yan16PositionNormal`, the surface is a mixture of *elements*: Gaussians in position ×
+in :cite:`Yan2016`, the surface is a mixture of *elements*: Gaussians in position ×
 normal space, :monosp:`step` texels apart, each aligned with the normals of the map around it. The
 P-NDF, the distribution of the normals under a pixel's footprint, is then a sum in closed form,
 
@@ -164,7 +164,7 @@ coordinates.
         'material': 'Al'
 
 Reference: Ling-Qi Yan, Miloš Hašan, Steve Marschner and Ravi Ramamoorthi, "Position-Normal
-Distributions for Efficient Rendering of Specular Microstructure" (:cite:`Yan16PositionNormal`),
+Distributions for Efficient Rendering of Specular Microstructure" (:cite:`Yan2016`),
 section 5.
 """
 

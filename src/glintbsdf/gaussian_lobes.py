@@ -44,6 +44,7 @@ class Gaussian:
     Attributes:
         xx, xy, yy, determinant (mi.Float): the covariance; the determinant must be > 0 wherever
             the Gaussian is evaluated.
+        peak (mi.Float): the density's value at 0.
     """
 
     def __init__(self, vectors: tuple = (), variance: float | mi.Float = 0.0) -> None:
@@ -56,18 +57,19 @@ class Gaussian:
         for v, w in combinations(self.vectors, 2):
             determinant = determinant + dr.square(cross(v, w))
         self.xx, self.xy, self.yy, self.determinant = xx, xy, yy, determinant
+        self.inverse_root = dr.rsqrt(determinant)
+        self.peak = self.inverse_root * (1 / (2 * pi))
 
     def distance_squared(self, d: mi.Vector2f) -> mi.Float:
         """The squared Mahalanobis distance of ``d``."""
         form = self.variance * dr.squared_norm(d)
         for v in self.vectors:
             form = form + dr.square(cross(v, d))
-        return form / self.determinant
+        return form * dr.square(self.inverse_root)
 
     def eval(self, d: mi.Vector2f) -> mi.Float:
         """The density at ``d``."""
-        peak = dr.rsqrt(self.determinant) * (1 / (2 * pi))
-        return peak * dr.exp(-0.5 * self.distance_squared(d))
+        return self.peak * dr.exp(-0.5 * self.distance_squared(d))
 
     def root(self) -> tuple[mi.Vector2f, mi.Vector2f]:
         """Two vectors with the same covariance, (a, b) and (0, c); zero for a covariance of 0."""

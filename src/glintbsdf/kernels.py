@@ -14,7 +14,6 @@ Positions are in texels: texel (row i, column j) has its centre at (j, i).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import pi
 
 import drjit as dr
@@ -92,8 +91,6 @@ class TexelKernel:
 
     Args:
         added (texels²): variance added to Σ along u and v, :data:`SIGMA_MIN` squared by default.
-        reach: where else than at :data:`REACH` the kernel is cut, as a function that returns the
-            Mahalanobis distance for a minor standard deviation of the footprint (texels).
 
     Attributes:
         du, dv (mi.Vector2f): the footprint's axes in texels, limited, before ``added``.
@@ -110,7 +107,6 @@ class TexelKernel:
         width: int,
         wrap_mode: str,
         added: tuple = (SIGMA_MIN**2, SIGMA_MIN**2),
-        reach: Callable[[mi.Float], mi.Float] | None = None,
     ) -> None:
         check_choice("TexelKernel", "kernel", kernel, KERNELS)
         self.kernel = kernel
@@ -141,27 +137,36 @@ class TexelKernel:
         self.sigma_u, self.sigma_v = dr.sqrt(variance_u), dr.sqrt(variance_v)
         self.shear = covariance / variance_v
         self.sigma_u_given_v = dr.sqrt(determinant / variance_v)
-        reach = REACH[kernel] if reach is None else reach(dr.sqrt(self.minor_variance))
+        self.inverse_u_given_v = dr.rcp(self.sigma_u_given_v)
+        self.inverse_v = dr.rcp(self.sigma_v)
+        self.cut_at(REACH[kernel])
+
+    def cut_at(self, reach: float | mi.Float) -> None:
+        """Cut the kernel at this Mahalanobis distance (the box: so many standard deviations)."""
         self.reach = reach
         self.reach_u, self.reach_v = reach * self.sigma_u, reach * self.sigma_v
-        if kernel == "box":
+        if self.kernel == "box":
             self.peak = dr.rcp(4 * self.reach_u * self.reach_v)
-        else:
-            self.inverse_u_given_v = dr.rcp(self.sigma_u_given_v)
-            self.inverse_v = dr.rcp(self.sigma_v)
-            mass = 2 * pi * (1 - dr.exp(-0.5 * reach**2)) if kernel == "gaussian" else pi * reach**2
-            self.peak = self.inverse_u_given_v * self.inverse_v / mass
-            # Row at which the ellipse reaches furthest to the right.
-            self.row_of_reach_u = reach * covariance / self.sigma_u
+            return
+        gaussian = self.kernel == "gaussian"
+        mass = 2 * pi * (1 - dr.exp(-0.5 * reach**2)) if gaussian else pi * reach**2
+        self.peak = self.inverse_u_given_v * self.inverse_v / mass
+        # Row at which the ellipse reaches furthest to the right.
+        self.row_of_reach_u = reach * self.shear * dr.square(self.sigma_v) / self.sigma_u
+
+    def whitened(self, offset):
+        """The linear map of an offset (texels) to a vector of length ρ (not for the box)."""
+        return mi.Vector2f(
+            dr.fma(-self.shear, offset.y, offset.x) * self.inverse_u_given_v,
+            offset.y * self.inverse_v,
+        )
 
     def value(self, offset):
         """k(Δ) in 1/texel², for ``offset`` Δ = u − x in texels."""
         if self.kernel == "box":
             inside = (dr.abs(offset.x) <= self.reach_u) & (dr.abs(offset.y) <= self.reach_v)
             return dr.select(inside, self.peak, 0)
-        u = dr.fma(-self.shear, offset.y, offset.x) * self.inverse_u_given_v
-        v = offset.y * self.inverse_v
-        rho2 = dr.fma(u, u, v * v)
+        rho2 = dr.squared_norm(self.whitened(offset))
         inside = rho2 <= self.reach**2
         if self.kernel == "disk":
             return dr.select(inside, self.peak, 0)

@@ -12,6 +12,7 @@ integrates to one; and the sampler draws from exactly this density.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import ceil, exp, inf, pi, sqrt
 
 import drjit as dr
@@ -28,14 +29,14 @@ from ..normalmap import NormalMap
 from .quad_lists import QuadLists, every_quad
 
 #: Of the lists; part of their name in the cache.
-VERSION = 1
+VERSION = 2
 
 #: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
 FEW_CELLS = 25
 
-#: Where an element's normals are cut, in standard deviations along its principal axes: 1.3e-4 of
+#: Where an element's normals are cut, in standard deviations along its principal axes: 4.3e-4 of
 #: its mass lie outside. Only what large footprints skip: small ones sum without a cut.
-NORMAL_REACH = 4.0
+NORMAL_REACH = 3.7
 
 #: Bounds of the roughness. Half vectors in float32 are 6e-8 apart: below 1e-7 there is only noise,
 #: and determinants underflow from 1e-9 on.
@@ -48,13 +49,24 @@ MAX_SEEDS = 4
 MAX_ATTEMPTS = 64
 
 
-def position_reach(sigma: mi.Float) -> mi.Float:
-    """Where the sum over elements is cut, as a Mahalanobis distance of N(0, T).
+#: Elements fade in ρ², the squared Mahalanobis distance from the footprint's centre in N(0, T),
+#: over this width until they are cut.
+FADE = 2.0
 
-    ``sigma`` is the minor standard deviation of T, in steps. The mass inside of the cut is known in
-    closed form, but for a ripple that falls with ``sigma``: this cut keeps it below 5e-4.
+
+def cut_of_sums(sigma: mi.Float) -> mi.Float:
+    """ρ² of the cut where all elements are summed, and with them W: any cut keeps ∫D = 1.
+
+    ``sigma`` is the minor standard deviation of T, in steps. A large footprint is cut as that of
+    other kernels, half of the fade within 3 standard deviations, half beyond. Where it is a point,
+    the elements around it are interpolated, and the nearest are the best.
     """
-    return dr.maximum(3.75 - 0.25 * dr.log2(sigma), 3)
+    return 10 - 4 * SIGMA_H**2 / dr.square(sigma)
+
+
+def cut_of_lists(sigma: mi.Float) -> mi.Float:
+    """ρ² of the cut where W is known in closed form: its ripple stays below 5e-4."""
+    return 10 + 3.5 * dr.maximum(dr.log2(2.5 / sigma), 0)
 
 
 class SeedAxis:
@@ -81,6 +93,11 @@ class SeedAxis:
         # One seed to a texel or less: midway between texel centres, where bilinear interpolation
         # has no kink.
         self.offset = 0.5 / self.seeds if self.cell <= 1 else 0.5 / self.cell
+
+    @property
+    def places(self) -> list[float]:
+        """Places of the seeds in a cell."""
+        return [self.offset + k / self.seeds for k in range(self.seeds)]
 
     @property
     def inner_cells(self) -> int:
@@ -120,10 +137,13 @@ class Mixture:
     #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
     origin = (0.0, 0.0)
 
-    def elements(self, row, column, active) -> list[tuple]:
-        """The elements of a stored cell: each its place in the cell (``mi.Vector2f``), its area
-        (cells), its normal s_i (``mi.Vector2f``) and its Jacobian per cell (``mi.Matrix2f``, or
-        None for a flat one)."""
+    def seen(self, kernel: TexelKernel) -> Callable:
+        """What the footprint makes of elements, as a function ``(m, row, column, corner, active)``.
+
+        It lists the elements of a stored cell, whose ``corner`` is given from the footprint's
+        centre (cells): of each its area (cells), ρ² of its place, the peak of its normals'
+        density, and the squared Mahalanobis distance of the projected normal ``m`` from them.
+        """
         raise NotImplementedError
 
     def mass(self, kernel: TexelKernel) -> mi.Float:
@@ -142,58 +162,59 @@ class Mixture:
         """Normal and Jacobian of the seed with these indices."""
         raise NotImplementedError
 
-    def kernel(self, footprint) -> TexelKernel:
-        """N(0, T), which weighs the elements, in cells."""
+    def kernel(self, footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
+        """N(0, T), which weighs the elements, in cells; whether to sum all that it covers; and ρ²
+        of its cut."""
         columns, rows = self.map_cells
-        kernel = TexelKernel(
-            "gaussian",
-            footprint,
-            rows,
-            columns,
-            self.wrap_mode,
-            added=(self.variance, self.variance),
-            reach=lambda sigma: position_reach(sigma * (SIGMA_H / sqrt(self.variance))),
-        )
+        added = (self.variance, self.variance)
+        kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
         kernel.mean = kernel.mean - mi.Vector2f(*self.origin)
-        return kernel
+        steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
+        cut = cut_of_sums(steps)
+        kernel.cut_at(dr.sqrt(cut))
+        few = kernel.touched_quads() <= FEW_CELLS
+        cut = dr.select(few, cut, cut_of_lists(steps))
+        kernel.cut_at(dr.sqrt(cut))
+        return kernel, few, cut
 
     def overlap(self, kernel: TexelKernel) -> Overlap:
         """What the footprint sees of every element."""
         return Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=self.variance))
-
-    def normals(self, overlap: Overlap, jacobian, offset) -> tuple[mi.Vector2f, Gaussian]:
-        """Mean, from s_i, and distribution about it of an element's normals under the footprint.
-
-        ``offset`` (cells): from the footprint's centre to the element's.
-        """
-        roughness = Gaussian(variance=dr.square(self.sigma_r))
-        if jacobian is None:
-            return mi.Vector2f(0), roughness
-        return jacobian @ overlap.mean(-offset), overlap.normals(jacobian, roughness)
 
     def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it.
 
         ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
         """
-        kernel = self.kernel(footprint)
-        overlap = self.overlap(kernel)
+        kernel, few, cut = self.kernel(footprint)
+        seen = self.seen(kernel)
         active = mi.Bool(active) & (dr.squared_norm(m) < 1)
-        few = kernel.touched_quads() <= FEW_CELLS
 
-        def add(density, row, column, corner, active):
+        def share(area, near):
+            return area * dr.clip((cut - near) * (1 / FADE), 0, 1)
+
+        def add(density, *cell):
             total = mi.Float(0)
-            for place, area, normal, jacobian in self.elements(row, column, active):
-                offset = corner + place
-                mean, distribution = self.normals(overlap, jacobian, offset)
-                weight = area * kernel.value(offset)
-                total = dr.fma(weight, distribution.eval(m - normal - mean), total)
-            return density + dr.select(active, total, 0)
+            for area, near, peak, alike in seen(m, *cell):
+                weight = share(area, near) * peak
+                total = dr.fma(weight, dr.exp(-0.5 * (near + alike)), total)
+            return density + dr.select(cell[-1], total, 0)
 
-        density = every_quad(self.lattice, kernel, add, active & few)
+        def add_both(sums, *cell):
+            total = mi.Vector2f(0)
+            for area, near, peak, alike in seen(m, *cell):
+                weight = share(area, near) * dr.exp(-0.5 * near)
+                total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * alike), weight)
+            return sums + dr.select(cell[-1], total, 0)
+
+        density, mass = every_quad(self.lattice, kernel, add_both, active & few, mi.Vector2f(0))
         listed = active & ~few & self.lists.covers(m)
         density = density + self.lists.visit(m, kernel, add, listed)
-        return density / self.mass(kernel)
+        # Under the fade, this share of a Gaussian is left.
+        faded = 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
+        gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
+        mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * faded * self.mass(kernel))
+        return density / mass
 
     def sample(
         self, footprint, sample1: mi.Float, sample2: mi.Point2f, active: bool | mi.Bool = True
@@ -207,7 +228,7 @@ class Mixture:
 
         A normal outside the disk is an invalid sample, as D is 0 there.
         """
-        kernel = self.kernel(footprint)
+        kernel, _, cut = self.kernel(footprint)
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
 
         def attempt(count, x, y, offset, active):
@@ -220,7 +241,8 @@ class Mixture:
             position = kernel.mean + kernel.du * point.x + kernel.dv * point.y
             x, y, place, probability = self.draw_seed(position, second[0], second[1], active)
             offset = mi.Vector2f(place - kernel.mean)
-            accepted = (second[2] < probability) & (kernel.value(offset) > 0)
+            fade = (cut - dr.squared_norm(kernel.whitened(offset))) * (1 / FADE)
+            accepted = second[2] < probability * dr.minimum(fade, 1)
             count = count + 1
             return count, x, y, offset, active & ~accepted & (count < MAX_ATTEMPTS)
 
@@ -232,10 +254,14 @@ class Mixture:
                 label="element",
             )
         normal, jacobian = self.element(x, y, active)
-        mean, distribution = self.normals(self.overlap(kernel), jacobian, offset)
+        mean, distribution = normal, Gaussian(variance=dr.square(self.sigma_r))
+        if jacobian is not None:
+            overlap = self.overlap(kernel)
+            mean = normal - jacobian @ overlap.mean(offset)
+            distribution = overlap.normals(jacobian, distribution)
         random = pcg3d(bits[0], bits[1], bits[2] + 3 * count + 2)
         z = mi.warp.square_to_std_normal(mi.Point2f(uniform(random[0]), uniform(random[1])))
-        return normal + mean + distribution.sample(mi.Vector2f(z))
+        return mean + distribution.sample(mi.Vector2f(z))
 
     @property
     def nbytes(self) -> int:
@@ -270,7 +296,8 @@ class Elements(Mixture):
     Belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
-        normal_map (NormalMap): the map; between texel centres, normals are interpolated bilinearly.
+        normal_map (NormalMap): the map; between texel centres, normals are those of the triangle
+            mesh of :mod:`~glintbsdf.reference`.
         sigma_r (float): intrinsic roughness σ_r, the standard deviation of a projected normal.
         step (float): h, texels from one seed to the next. It is rounded so that a whole number of
             steps makes the map.
@@ -305,26 +332,32 @@ class Elements(Mixture):
     def build(self, cached=lambda build: build()) -> None:
         """Make everything that depends on ``data`` and ``sigma_r``."""
         height, width, _ = self.data.shape
-        self.axes = SeedAxis(width, self.step), SeedAxis(height, self.step)
-        x, y = self.axes
-        self.map_cells = x.cells, y.cells
-        self.seeds = x.seeds
+        self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
+        self.map_cells, self.seeds = (x.cells, y.cells), x.seeds
         self.variance = (SIGMA_H / self.seeds) ** 2
         self.origin = tuple(0.5 / axis.cell - 0.5 for axis in self.axes)
 
         self.texels = Lattice(height, width, self.wrap_mode)
-        if x.cells == width and y.cells == height:
-            self.lattice = self.texels
-        else:
-            clamped = self.wrap_mode == "clamp"
-            self.lattice = Lattice(
-                *(axis.inner_cells if clamped else axis.cells for axis in (y, x)), self.wrap_mode
-            )
         self.vertices = dr.ravel(
             dr.gather(mi.Vector2f, self.data.array, mi.UInt32(self.texels.source))
         )
         dr.eval(self.vertices)
         self.element_bytes = 4 * dr.width(self.vertices)
+        self.aligned = self.map_cells == (width, height)
+        self.lattice = self.texels
+        if not self.aligned:
+            clamped = self.wrap_mode == "clamp"
+            cells = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
+            self.lattice = Lattice(*cells, self.wrap_mode)
+
+        # By the side of the diagonal, so that elements with the same Jacobian are neighbours.
+        self.places = sorted(
+            ((u, v) for v in y.places for u in x.places),
+            key=lambda place: side_of_diagonal(*place),
+        )
+        self.anchors = self.places
+        if self.aligned and self.curved:
+            self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
         self.lists = QuadLists(self.lattice, cached(self.build_lists))
 
     # --------------------------------------------------------------------------------------------
@@ -338,40 +371,68 @@ class Elements(Mixture):
             for index in self.texels.corners(row, column)
         ]
 
-    def located(self, row, column, place):
-        """The quad of texels (row, column) that holds a ``place`` in a stored cell, and where."""
-        if self.lattice is self.texels:
-            return row, column, place
-        (x, y), (fx, fy) = self.axes, place
-        column, fx = x.texel(column, fx, self.wrap_mode)
-        row, fy = y.texel(row, fy, self.wrap_mode)
-        return row, column, mi.Vector2f(fx, fy)
+    def located(self, row, column, x, y):
+        """The quad of texels that holds the place (``x``, ``y``) of a stored cell, and where.
 
-    def interpolated(self, normals, place):
-        """The bilinear normal at a ``place`` in a quad, and its Jacobian per cell if curved."""
-        n0, n1, n2, n3 = normals
-        along_x, along_y, twist = n1 - n0, n2 - n0, n3 - n2 - (n1 - n0)
-        across = along_x + twist * place.y
-        normal = n0 + across * place.x + along_y * place.y
+        Returns row and column as stored, and the place in the quad.
+        """
+        if self.aligned:
+            return row, column, x, y
+        column, x = self.axes[0].texel(column, x, self.wrap_mode)
+        row, y = self.axes[1].texel(row, y, self.wrap_mode)
+        return row, column, x, y
+
+    def jacobian(self, normals, side):
+        """The mesh's Jacobian, per cell, on this side of a quad's diagonal; None if flat."""
         if not self.curved:
-            return normal, None
-        x, y = self.axes
-        along_x, along_y = across * x.cell, (along_y + twist * place.x) * y.cell
-        return normal, mi.Matrix2f(along_x.x, along_y.x, along_x.y, along_y.y)
+            return None
+        n0, n1, n2, n3 = normals
+        along_x = mixed(n1 - n0, n3 - n2, side) * self.axes[0].cell
+        along_y = mixed(n2 - n0, n3 - n1, side) * self.axes[1].cell
+        return mi.Matrix2f(along_x.x, along_y.x, along_x.y, along_y.y)
 
     def elements(self, row, column, active):
-        x, y = self.axes
-        places = [
-            mi.Vector2f(x.offset + i / x.seeds, y.offset + j / y.seeds)
-            for j in range(y.seeds)
-            for i in range(x.seeds)
-        ]
-        area = 1 / len(places)
-        row, column, _ = located = self.located(row, column, places[0])
+        """The elements of a stored cell, in the order of ``places``.
+
+        Of each, the mesh's normal at the element's anchor, a place in the cell, and its Jacobian
+        (``mi.Matrix2f``, per cell), None for a flat one.
+        """
+        row, column, *inside = self.located(row, column, *self.places[0])
         normals = self.corner_normals(row, column, active)
-        if len(places) == 1:
-            return [(places[0], area, *self.interpolated(normals, located[2]))]
-        return [(place, area, *self.interpolated(normals, place)) for place in places]
+        if not self.aligned:
+            jacobian = self.jacobian(normals, side_of_diagonal(*inside))
+            return [(normal_at(normals, *inside), jacobian)]
+        sides = [side_of_diagonal(*place) for place in self.places]
+        jacobians = {side: self.jacobian(normals, side) for side in set(sides)}
+        if not self.curved:
+            return [(normal_at(normals, *place), None) for place in self.places]
+        return [(normals[ANCHORS[side][1]], jacobians[side]) for side in sides]
+
+    def seen(self, kernel):
+        roughness = Gaussian(variance=dr.square(self.sigma_r))
+        overlap = self.overlap(kernel)
+        area = 1 / len(self.places)
+        # What does not depend on the cell.
+        whitened = [kernel.whitened(mi.Vector2f(*place)) for place in self.places]
+        steps = [
+            overlap.gain @ mi.Vector2f(*place) - mi.Vector2f(*place) + mi.Vector2f(*anchor)
+            for place, anchor in zip(self.places, self.anchors, strict=True)
+        ]
+
+        def seen(m, row, column, corner, active):
+            white_corner, step = kernel.whitened(corner), overlap.gain @ corner
+            distribution, of = roughness, None
+            for k, (normal, jacobian) in enumerate(self.elements(row, column, active)):
+                delta = m - normal
+                if jacobian is not None:
+                    # m − (s_i + J μ): the normal is that of the anchor, and μ = −S T⁻¹ offset.
+                    delta = delta + jacobian @ (step + steps[k])
+                    if jacobian is not of:
+                        distribution, of = overlap.normals(jacobian, roughness), jacobian
+                near = dr.squared_norm(white_corner + whitened[k])
+                yield area, near, distribution.peak, distribution.distance_squared(delta)
+
+        return seen
 
     def element(self, x, y, active):
         cells, places = zip(
@@ -379,8 +440,9 @@ class Elements(Mixture):
             strict=True,
         )
         column, row = self.lattice.x.locate(cells[0])[1], self.lattice.y.locate(cells[1])[1]
-        row, column, place = self.located(row, column, mi.Vector2f(*places))
-        return self.interpolated(self.corner_normals(row, column, active), place)
+        row, column, *inside = self.located(row, column, *places)
+        normals = self.corner_normals(row, column, active)
+        return normal_at(normals, *inside), self.jacobian(normals, side_of_diagonal(*inside))
 
     def draw_seed(self, position, random_x, random_y, active):
         offset = mi.Vector2f(*(axis.offset for axis in self.axes))
@@ -411,20 +473,26 @@ class Elements(Mixture):
         element, cut at ``NORMAL_REACH``.
         """
         with dr.suspend_grad():
-            elements = self.elements(row, column, active)
+            elements = [
+                (normal, mi.Vector2f(place) - mi.Vector2f(anchor), jacobian)
+                for (normal, jacobian), place, anchor in zip(
+                    self.elements(row, column, active), self.places, self.anchors, strict=True
+                )
+            ]
             edges = [mi.Vector2f(1, 0), mi.Vector2f(0, 1)]
-            corner = mi.Vector2f(0)
             if self.curved:
                 edges[0] = principal_axis(sum(jacobian for *_, jacobian in elements))
                 edges[1] = mi.Vector2f(-edges[0].y, edges[0].x)
+            corner = mi.Vector2f(0)
             for k, axis in enumerate(edges):
                 lower, upper = mi.Float(inf), mi.Float(-inf)
-                for _, _, normal, jacobian in elements:
-                    variance = dr.square(self.sigma_r)
+                for normal, step, jacobian in elements:
+                    centre, variance = dr.dot(normal, axis), dr.square(self.sigma_r)
                     if jacobian is not None:
                         image = jacobian.T @ axis
+                        centre = centre + dr.dot(image, step)
                         variance = dr.fma(self.variance, dr.squared_norm(image), variance)
-                    centre, reach = dr.dot(normal, axis), NORMAL_REACH * dr.sqrt(variance)
+                    reach = NORMAL_REACH * dr.sqrt(variance)
                     lower = dr.minimum(lower, centre - reach)
                     upper = dr.maximum(upper, centre + reach)
                 corner = corner + lower * axis
@@ -477,6 +545,34 @@ class Elements(Mixture):
             f"{'curved' if self.curved else 'flat'}, sigma_r={self.sigma_r[0]:g}, "
             f"step={self.step:g}, {self.nbytes / 2**20:.1f} MiB]"
         )
+
+
+#: By the side of a quad's diagonal: a corner at which the mesh has the normal that a Jacobian there
+#: begins from, as a place and as an index.
+ANCHORS = {0.0: ((0, 0), 0), 0.5: ((1, 0), 1), 1.0: ((1, 1), 3)}
+
+
+def side_of_diagonal(x, y):
+    """0 for the place (``x``, ``y``) in the first triangle of a quad, 1 in the second, or ½."""
+    beyond = x + y - 1
+    return dr.select(dr.abs(beyond) < 1e-5, 0.5, dr.select(beyond > 0, 1.0, 0.0))
+
+
+def mixed(first, second, share):
+    """(1 − ``share``) ``first`` + ``share`` ``second``."""
+    if isinstance(share, float) and share in (0, 1):
+        return second if share else first
+    return first + (second - first) * share
+
+
+def normal_at(normals, x, y):
+    """The mesh's normal at the place (``x``, ``y``) of a quad with these corner normals.
+
+    The triangles (n0, n1, n2) and (n3, n2, n1) differ by a kink along their diagonal.
+    """
+    n0, n1, n2, n3 = normals
+    kink = n3 - n2 - (n1 - n0)
+    return n0 + (n1 - n0) * x + (n2 - n0) * y + kink * dr.maximum(x + y - 1, 0)
 
 
 def check_sigma_r(owner: str, sigma_r: float) -> None:
