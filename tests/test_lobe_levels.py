@@ -87,12 +87,12 @@ def assert_same_moments(a: Lobes, b: Lobes, tolerance: float, size: float) -> No
 
 
 def test_texels_become_the_lobes_of_equation_5():
-    lobes = texel_lobes(SAMPLE.normals)
-    jacobian = np.gradient(SAMPLE.normals.astype(float), axis=1)[20, 30]
-    lobe = lobes[20 * 64 + 30]
-    assert np.allclose(lobe.mean, [0.5, 0.5, *SAMPLE.normals[20, 30]])
+    lobes, n = texel_lobes(SAMPLE.normals), SAMPLE.normals.astype(float)
+    lobe, (n0, n1), (n2, n3) = lobes[20 * 64 + 30], *(n[y, 30:32] for y in (20, 21))
+    assert np.allclose(lobe.mean, [1, 1, *(n1 + n2) / 2])
     assert np.allclose(lobe.covariance[:2, :2], SIGMA_H**2 * np.eye(2))
-    assert np.allclose(lobe.covariance[2:, 0], SIGMA_H**2 * jacobian)
+    assert np.allclose(lobe.covariance[2:, 0], SIGMA_H**2 * (n1 - n0 + n3 - n2) / 2)
+    assert np.allclose(lobe.covariance[2:, 1], SIGMA_H**2 * (n2 - n0 + n3 - n1) / 2)
     # All that normals vary comes from the position
     assert np.allclose(factors(lobes.covariance)[2], 0, atol=1e-6)
 

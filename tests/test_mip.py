@@ -45,7 +45,7 @@ def sum_of_texels(mip: Mip, uv, sigma: float, normals: np.ndarray) -> np.ndarray
     x, y = (v.ravel() for v in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     x, y = x + int(centre[0]), y + int(centre[1])
     lobes = texel_lobes(synthesis.normals)[synthesis.source(y % size, x % size)]
-    d = centre - np.stack((x, y), axis=1) - 0.5
+    d = centre - np.stack((x, y), axis=1) - lobes.mean[:, :2]
     total = variance + SIGMA_H**2
     weight = np.exp(-0.5 * (d**2).sum(axis=1) / total)
     seen = weight > 1e-4  # all but 1e-4 of the mass

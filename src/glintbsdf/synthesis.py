@@ -31,23 +31,25 @@ REUSE = 24
 BEFORE_X, BEFORE_Y = 1, 2
 
 
-def jacobians(normals: np.ndarray) -> np.ndarray:
-    """∂n/∂u of every texel, per texel: H×W×2×2, the last axis being (x, y) of the position.
+def mesh_lobes(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean normals and Jacobians of the lobes of a map, H×W×2 and H×W×2×2, per texel.
 
-    Central differences, one-sided at the border: what lies beyond it is not part of the sample.
-    A sample one texel wide varies along the other axis only.
+    One lobe per texel, in the middle between it and the next texels in x, in y and in both: there
+    the triangle mesh of :mod:`~glintbsdf.reference` has the normal (n1 + n2)/2, and the mean
+    Jacobian of the two triangles that meet. The last axis of Jacobians is (x, y) of the position.
+    What lies beyond the last row and column is taken to be like them.
     """
-    along = [
-        np.gradient(normals, axis=axis) if normals.shape[axis] > 1 else np.zeros_like(normals)
-        for axis in (1, 0)
-    ]
-    return np.stack(along, axis=-1)
+    n = np.pad(normals, ((0, 1), (0, 1), (0, 0)), mode="edge")
+    n0, n1, n2, n3 = n[:-1, :-1], n[:-1, 1:], n[1:, :-1], n[1:, 1:]
+    jacobian = np.stack((n1 - n0 + n3 - n2, n2 - n0 + n3 - n1), axis=-1) / 2
+    return (n1 + n2) / 2, jacobian
 
 
 def lobe_features(normals: np.ndarray, balance: float) -> np.ndarray:
     """Vectors whose squared distance is Eq. 7, ``α |n_i − n_j|² + (1 − α) |J_i − J_j|²``: H×W×6."""
-    gradients = jacobians(normals).reshape(*normals.shape[:2], 4)
-    return np.concatenate((sqrt(balance) * normals, sqrt(1 - balance) * gradients), axis=2)
+    mean, jacobian = mesh_lobes(normals)
+    gradients = jacobian.reshape(*mean.shape[:2], 4)
+    return np.concatenate((sqrt(balance) * mean, sqrt(1 - balance) * gradients), axis=2)
 
 
 def minimum_error_cut(error: np.ndarray) -> np.ndarray:
@@ -308,7 +310,8 @@ class _Quilt:
         self.side = int(self.steps.max()) + overlap
 
         rng = np.random.default_rng(seed)
-        places = (normals.shape[0] - self.side + 1, normals.shape[1] - self.side + 1)
+        # The last row and column have no lobes of their own.
+        places = (normals.shape[0] - self.side, normals.shape[1] - self.side)
         total = places[0] * places[1]
         wanted = ceil(REUSE * normals.shape[0] * normals.shape[1] / patch_size**2)
         chosen = rng.choice(total, min(total, wanted), replace=False)

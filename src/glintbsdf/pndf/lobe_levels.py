@@ -26,7 +26,7 @@ import numpy as np
 
 from ..gaussian_lobes import SIGMA_H
 from ..progress import progress
-from ..synthesis import Synthesis, jacobians
+from ..synthesis import Synthesis, mesh_lobes
 from . import packed_lobes
 
 #: Smallest grid, texels: clusters of grids much smaller would hold one or two texels each.
@@ -36,7 +36,7 @@ SMALLEST_GRID = 12
 ITERATIONS = 8
 
 #: Of what :func:`build` returns; part of the cache's key.
-VERSION = 1
+VERSION = 2
 
 
 @dataclass
@@ -74,17 +74,17 @@ class Lobes:
 
 
 def texel_lobes(normals: np.ndarray) -> Lobes:
-    """The lobe of every texel of a map (Eq. 4, 5), at its centre in the first texel: H·W lobes.
+    """The lobes of a map (Eq. 4, 5), one per texel, from the texel's corner: H·W lobes.
 
     S = σ_h² I, the cross-covariance J S, and J S Jᵀ for the normals; the intrinsic roughness σ_r is
-    left to evaluation.
+    left to evaluation. Lobes stand where :func:`~glintbsdf.synthesis.mesh_lobes` puts them, half a
+    texel beyond the texel's centre, at (1, 1).
     """
-    jacobian = jacobians(normals.astype(np.float64)).reshape(-1, 2, 2)
-    count = len(jacobian)
-    mean = np.concatenate((np.full((count, 2), 0.5), normals.reshape(-1, 2)), axis=1)
+    mean, jacobian = (v.reshape(-1, *v.shape[2:]) for v in mesh_lobes(normals.astype(np.float64)))
+    count = len(mean)
     spread = np.concatenate((np.broadcast_to(np.eye(2), (count, 2, 2)), jacobian), axis=1)
     covariance = SIGMA_H**2 * spread @ spread.transpose(0, 2, 1)
-    return Lobes(np.ones(count), mean, covariance)
+    return Lobes(np.ones(count), np.concatenate((np.ones((count, 2)), mean), axis=1), covariance)
 
 
 def merged(lobes: Lobes, label: np.ndarray, count: int) -> Lobes:

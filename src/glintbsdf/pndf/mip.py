@@ -193,16 +193,17 @@ class Mip:
         """
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
-            # A texel's lobe is as wide as a texel: those around the footprint count as well.
-            added = dr.select(level == 0, mi.Float(SIGMA_H**2), 0)
-            reach = self.texel_kernel(footprint, added)
-            centre = mi.Vector2f(reach.mean) + 0.5  # from the map's edge
+            # A texel's lobe is as wide as a texel: those around the footprint count as well. It
+            # stands between this texel and the next; in a mirror image, the one before.
+            texels = level == 0
+            width, shift = (SIGMA_H + 0.5 / 3, 0.0) if mirrored else (SIGMA_H, 0.5)
+            reach = self.texel_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
+            centre = mi.Vector2f(reach.mean) + dr.select(texels, 0.5 - shift, 0.5)
             rows, columns = grids.y.on(level, active), grids.x.on(level, active)
             top = rows.locate(centre.y - reach.reach_v)
             bottom = rows.locate(centre.y + reach.reach_v)
             extent = dr.gather(mi.Float, grids.extent, level, active)
-        texels = level == 0
-        mean = mi.Vector2f(kernel.mean) + 0.5
+        mean = mi.Vector2f(kernel.mean) + 0.5  # from the map's edge
 
         def next_row(y, x, right):
             y = y + 1
