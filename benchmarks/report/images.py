@@ -25,6 +25,10 @@ LIGHT_RADIUS = 0.07
 FOOTPRINT_SIGMA = 12**-0.5
 
 
+#: Seconds for a process to end by itself.
+PATIENCE = 20
+
+
 @dataclass(frozen=True)
 class Settings:
     """How the image level is measured.
@@ -60,16 +64,25 @@ class Renderer:
         self.process = context.Process(target=serve, args=(other, *arguments), daemon=True)
         self.process.start()
         other.close()
-        self.building, self.first_frame = self.connection.recv()
+        self.building, self.first_frame = self.receive()
+
+    def receive(self):
+        try:
+            return self.connection.recv()
+        except EOFError:
+            raise RuntimeError("a process that renders has failed, see above") from None
 
     def render(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
         """An image with footprints of ``spp`` samples per pixel, and the seconds it took."""
         self.connection.send((spp, seed))
-        return self.connection.recv()
+        return self.receive()
 
     def close(self) -> None:
+        """End the process, after the image that it may be rendering."""
         self.connection.close()
-        self.process.join()
+        self.process.join(PATIENCE)
+        if self.process.is_alive():
+            self.process.terminate()
 
 
 def serve(connection, variant: str, *arguments: object) -> None:

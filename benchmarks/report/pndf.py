@@ -18,22 +18,30 @@ from glintbsdf.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_co
 
 from .methods import EXACT, SIGMA_R, Method, Surface
 
+#: Clamp of the Jacobian of those who have none: their own roughness hides it.
+UNCLAMPED = 1e-6
+
 #: Queries of the first call, which compiles, and of the one that says how long a batch shall be.
 FEW = 256
 
 #: Most queries of a batch.
 MOST = 2**18
 
-#: Seconds of evaluation beyond which fewer points per bin have to do.
-PATIENCE = 15.0
+#: Independent sets of points, whose spread tells the noise of a bin's mean; and the mean of a
+#: sample standard deviation of so many Gaussian numbers over the true one.
+SETS, BIAS = 4, 0.9213
+
+#: Most points of a set per bin and axis, if time allows.
+MOST_POINTS = 16
 
 
 @dataclass(frozen=True)
 class Settings:
     """How the P-NDF level is measured.
 
-    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``points``
-    per bin and axis; ``batch`` the seconds of a timed batch.
+    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``patience``
+    the seconds to spend on the bins of one P-NDF, if queries took as long as random ones in one
+    thread, which they do not; ``batch`` those of a timed batch.
     """
 
     size: int
@@ -41,7 +49,7 @@ class Settings:
     places: tuple[tuple[float, float], ...]
     res: int
     samples: int
-    points: int
+    patience: float
     repetitions: int
     batch: float
 
@@ -152,7 +160,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                     surface.normal_map,
                     place,
                     texel_covariance(surface.normal_map, radius / 3),
-                    epsilon=surface.epsilon,
+                    epsilon=surface.epsilon if sigma_r == 0 else UNCLAMPED,
                     sigma_r=sigma_r,
                     res=settings.res,
                     bounds=bounds,
@@ -162,12 +170,9 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                 pictures.setdefault(
                     f"reference {sigma_r:g}", references[sigma_r].density.astype(np.float32)
                 )
-            points = settings.points
-            while points > 2 and per_query[method] * (settings.res * points) ** 2 > PATIENCE:
-                points //= 2
-            density, deviation = in_bins(
-                pndf, surface.normal_map, place, radius, bounds, settings.res, points
-            )
+            footprint = texel_footprint(surface.normal_map, np.array(place)[:, None], radius / 3)
+            affordable = min(settings.patience / per_query[method], 2 * MOST)
+            density, deviation = in_bins(pndf, footprint, references[sigma_r], affordable)
             pictures.setdefault(method.name, density.astype(np.float32))
             own_noise = noise(references[sigma_r], deviation)
             results[method].append(
@@ -202,21 +207,36 @@ def roughness(pndf) -> float:
     return round(float(np.ravel(getattr(pndf, "sigma_r", 0.0))[0]), 9)
 
 
-def in_bins(pndf, normal_map, place, radius, bounds, res, points):
-    """Mean of D over every bin of the reference, and its standard error, by jittered points."""
-    (x_min, y_min), (x_max, y_max) = bounds
-    n = res * points
-    row, column = (np.indices((n, n)) + np.random.default_rng(0).random((2, n, n))) / n
-    m = mi.Vector2f(
-        mi.Float(np.float32(x_min + (x_max - x_min) * column).ravel()),
-        mi.Float(np.float32(y_min + (y_max - y_min) * row).ravel()),
-    )
-    uv = np.repeat(np.array(place)[:, None], n * n, axis=1)
-    density = pndf.eval(m, texel_footprint(normal_map, uv, radius / 3)).numpy()
-    split = density.reshape(res, points, res, points)
-    mean = split.mean(axis=(1, 3), dtype=np.float64)
-    # Stratified points have less noise than this.
-    return mean, split.std(axis=(1, 3), dtype=np.float64, ddof=1) / points
+def in_bins(pndf, footprint: Footprint, reference: BinnedPNDF, affordable: float):
+    """Mean of D over every bin of the reference, and its standard error, by jittered points.
+
+    Bins in which the reference has found something share about ``affordable`` points; the others,
+    which are empty or nearly so, have one in each of the sets.
+    """
+    lower, upper = np.array(reference.bounds)
+    size = (upper - lower) / reference.density.shape[::-1]
+    rng = np.random.default_rng(0)
+
+    def means(bins: np.ndarray, n: int) -> np.ndarray:
+        """Mean of D over n×n points in each of the bins."""
+        row, column = np.nonzero(bins)
+        corner = np.stack([column, row], axis=-1)[:, None]
+        stratum = np.stack(np.divmod(np.arange(n * n), n), axis=-1)
+        place = corner + (stratum + rng.random((len(row), n * n, 2))) / n
+        m = mi.Vector2f(np.float32((lower + size * place).reshape(-1, 2).T))
+        # As many lanes of the footprint as normals, like the queries that are timed.
+        lanes = Footprint(dr.repeat(footprint.uv, dr.width(m)), footprint.du, footprint.dv)
+        density = pndf.eval(m, lanes).numpy()
+        return density.reshape(len(row), n * n).mean(axis=1, dtype=np.float64)
+
+    found = reference.density > 0
+    points = int(np.clip(np.sqrt(affordable / (SETS * found.sum())), 1, MOST_POINTS))
+    mean, deviation = np.zeros((2, *found.shape))
+    for bins, n in ((found, points), (~found, 1)):
+        sets = [means(bins, n) for _ in range(SETS)]
+        mean[bins] = np.mean(sets, axis=0)
+        deviation[bins] = np.std(sets, axis=0, ddof=1) / (BIAS * SETS**0.5)
+    return mean, deviation
 
 
 def errors(reference: BinnedPNDF, density: np.ndarray) -> dict[str, float]:
