@@ -18,6 +18,8 @@ import numpy as np
 import OpenEXR
 import skimage.io
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from glintbsdf import maps
 
@@ -327,6 +329,67 @@ def disc() -> Mesh:
     return flipped(mesh)
 
 
+def car_door() -> Mesh:
+    """A car's door in the plane z = 0, 4 wide and 2 high: bulged, with a crease, a hollow below it
+    and a shut line. UVs are x and y."""
+    shut_line = -1.25
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        bulge = 0.45 * np.cos(0.75 * (t - 0.7)) - 0.035 * s**2
+        crease = -0.32 * np.hypot(t - 1.2 - 0.05 * s, 0.02)
+        hollow = -0.09 * np.exp(-(((t - 0.3 - 0.03 * s) / 0.22) ** 2))
+        gap = -0.05 * np.exp(-(((s - shut_line - 0.04 * np.sin(1.5 * t)) / 0.014) ** 4))
+        return np.stack([s, t, bulge + crease + hollow + gap], axis=-1)
+
+    around_gap = shut_line + np.linspace(-0.08, 0.08, 33)
+    s = np.unique(np.concatenate([np.linspace(-2, 2, 41), around_gap]))
+    t = np.unique(np.concatenate([np.linspace(0, 2, 41), np.linspace(1.0, 1.4, 33)]))
+    return parametric(position, s, t, lambda s, t: np.stack([s, t], axis=-1))
+
+
+def car_handle() -> Mesh:
+    """The door's handle, an arch over the plane y = 0, along x; 0.5 wide."""
+    path, length = spline(
+        [(-0.25, -0.02, 0), (-0.235, 0.05, 0), (-0.12, 0.085, 0), (0.12, 0.085, 0),
+         (0.235, 0.05, 0), (0.25, -0.02, 0)]
+    )  # fmt: skip
+    return tube(path, lambda t: 0.032 + 0 * t, length=length, segments=32, rings=48)
+
+
+def cushion(width: float, height: float, depth: float, rounding: float, swelling: float) -> Mesh:
+    """An upholstered block about the origin, its edges rounded and its faces swollen.
+
+    Each of its six faces is a patch of the cube, from which the surface stands off along the
+    direction to an inner box; UVs are lengths on the patch.
+    """
+    half = np.array([width, height, depth]) / 2
+    inner = half - rounding
+
+    def face(axis: int, sign: int) -> Mesh:
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+
+        def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+            p = np.empty((*s.shape, 3))
+            p[..., axis], p[..., i], p[..., j] = sign * half[axis], sign * s, t
+            away = p - np.clip(p, -inner, inner)
+            away /= np.linalg.norm(away, axis=-1, keepdims=True)
+            swell = swelling * np.cos(s / half[i] * np.pi / 2) * np.cos(t / half[j] * np.pi / 2)
+            return np.clip(p, -inner, inner) + (rounding + swell[..., None]) * away
+
+        grids = (np.linspace(-half[k], half[k], 25) for k in (i, j))
+        return parametric(position, *grids, lambda s, t: np.stack([s, t], axis=-1))
+
+    return joined([face(axis, sign) for axis in range(3) for sign in (1, -1)])
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """All of them as one mesh."""
+    offsets = np.cumsum([0] + [len(mesh.positions) for mesh in meshes[:-1]])
+    triangles = [mesh.triangles + k for mesh, k in zip(meshes, offsets, strict=True)]
+    vertices = (np.concatenate(arrays) for arrays in list(zip(*meshes, strict=True))[:3])
+    return Mesh(*vertices, np.concatenate(triangles))
+
+
 def flipped(mesh: Mesh) -> Mesh:
     """The same surface seen from its other side."""
     return mesh._replace(normals=-mesh.normals, triangles=mesh.triangles[:, ::-1])
@@ -344,6 +407,12 @@ MESHES = {
     "dress.ply": dress,
     "terrain.ply": terrain,
     "disc.ply": disc,
+    "car_door.ply": car_door,
+    "car_handle.ply": car_handle,
+    "sofa_seat.ply": lambda: cushion(1.6, 0.5, 1.6, 0.16, 0.10),
+    "sofa_back.ply": lambda: cushion(1.6, 1.2, 0.5, 0.16, 0.12),
+    "sofa_arm.ply": lambda: cushion(0.45, 1.1, 1.9, 0.2, 0.03),
+    "sofa_base.ply": lambda: cushion(3.2, 0.4, 1.8, 0.06, 0.0),
 }
 
 
@@ -386,6 +455,81 @@ def studio(height: int = 128) -> np.ndarray:
     return radiance
 
 
+def window(size: int = 256) -> np.ndarray:
+    """The light that comes through a window of coloured glass: (size, size, 3) radiance.
+
+    A rose of two rings of panes around a bright centre, in a lead frame, with a few lamps behind
+    it that are six hundred times as bright as the glass.
+    """
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
+    radius, angle = np.hypot(x, y), np.arctan2(y, x) / (2 * np.pi)
+    radiance = np.zeros((size, size, 3))
+    for inner, outer, panes, saturation in ((0.0, 0.2, 1, 0.15), (0.24, 0.56, 8, 0.8),
+                                            (0.6, 0.94, 16, 0.9)):  # fmt: skip
+        place = angle * panes
+        hue = np.floor(place) / panes * 3 + 0.15
+        colour = 1 - 2 * saturation * np.abs(
+            np.mod(hue[..., None] - np.array([0, 1, 2]) / 3, 1) - 0.5
+        )
+        distance = (np.abs(place - np.round(place))) * 2 * np.pi * radius / panes
+        lead = (distance > 0.025) | (panes == 1)
+        radiance += (((radius > inner) & (radius < outer) & lead)[..., None]) * colour
+    for lamp_x, lamp_y in ((0.0, 0.0), (0.4, 0.1), (-0.28, 0.3), (-0.1, -0.42), (0.55, -0.55)):
+        radiance[np.hypot(x - lamp_x, y - lamp_y) < 0.013] = 600.0
+    return radiance
+
+
+def grain(shape: tuple[int, int], widths: tuple[float, float], seed: int) -> np.ndarray:
+    """Periodic smooth noise of unit variance; ``widths`` in texels along rows and columns."""
+    noise = np.random.default_rng(seed).standard_normal(shape)
+    noise = gaussian_filter(noise, widths, mode="wrap")
+    return noise / noise.std()
+
+
+PLANKS, PLANKS_SIZE = 6, 768  # planks across the square of texels
+
+
+def planks() -> tuple[np.ndarray, np.ndarray]:
+    """Which plank each texel lies on, (size, size) int, and its distance to the next joint."""
+    y, x = np.mgrid[:PLANKS_SIZE, :PLANKS_SIZE] + 0.5
+    width = PLANKS_SIZE / PLANKS
+    row = np.floor(y / width).astype(int)
+    start = np.array([0.1, 0.55, 0.3, 0.8, 0.2, 0.65])[row] * PLANKS_SIZE
+    along, across = np.mod(x - start, PLANKS_SIZE), np.mod(y, width)
+    return row, np.minimum(np.minimum(across, width - across),
+                           np.minimum(along, PLANKS_SIZE - along))  # fmt: skip
+
+
+def wood_colour() -> np.ndarray:
+    """A floor of oak planks, (size, size, 3) sRGB in [0, 1]."""
+    row, joint = planks()
+    size = (PLANKS_SIZE, PLANKS_SIZE)
+    tone = np.array([0.05, -0.4, 0.3, -0.1, 0.5, -0.25])[row]
+    rings = np.sin(9 * grain(size, (14, 160), seed=11) + 7 * row)
+    tone = tone + 0.35 * rings + 0.25 * grain(size, (0.8, 30), seed=12)
+    colour = np.array([0.50, 0.34, 0.21]) * np.exp(0.28 * tone)[..., None] ** [1, 1.1, 1.25]
+    return np.clip(colour * (0.35 + 0.65 * np.clip(joint / 2.5, 0, 1))[..., None], 0, 1)
+
+
+def wood_height() -> np.ndarray:
+    """The same floor's relief, (size, size), in texels: worn edges, and pores along the grain."""
+    _, joint = planks()
+    edge = -2.0 * np.exp(-((joint / 3.0) ** 2))
+    return edge + 0.12 * grain((PLANKS_SIZE, PLANKS_SIZE), (1.5, 40), seed=12)
+
+
+def leather_height(size: int = 512, cells: int = 36) -> np.ndarray:
+    """Leather's relief, (size, size), in texels: grains parted by creases, periodic."""
+    rng = np.random.default_rng(21)
+    corner = np.stack(np.mgrid[:cells, :cells], axis=-1).reshape(-1, 2)
+    centres = (corner + rng.uniform(0.1, 0.9, corner.shape)) / cells
+    texel = (np.stack(np.mgrid[:size, :size], axis=-1).reshape(-1, 2) + 0.5) / size
+    nearest, second = cKDTree(centres, boxsize=1.0).query(texel, k=2)[0].T * size
+    crease = np.clip((second - nearest) / 7.0, 0, 1).reshape(size, size)
+    height = 2.2 * crease * (2 - crease) + 0.8 * grain((size, size), (20, 20), seed=22)
+    return gaussian_filter(height, 1.0, mode="wrap")
+
+
 def smooth_step(x: np.ndarray) -> np.ndarray:
     """0 below −1, 1 above 1, a cubic between."""
     x = np.clip(0.5 + 0.5 * x, 0, 1)
@@ -420,6 +564,9 @@ NORMAL_MAPS = {
     "scratched.exr": lambda: maps.scratched(
         MAP_SIZE, coverage=0.8, length=400, width=5, slope=0.4, alpha=0.05, seed=2
     ),
+    "polished.exr": lambda: maps.scratched(
+        MAP_SIZE, coverage=0.15, length=400, width=5, slope=0.3, alpha=0.0, seed=5
+    ),
     "brushed.exr": lambda: maps.brushed(
         MAP_SIZE, alpha=0.25, streak_length=60, streak_width=4, seed=3
     ),
@@ -438,6 +585,11 @@ def main(folder: Path) -> None:
     (folder / "palettes").mkdir(exist_ok=True)
     write_palette(folder / "palettes" / "sand.png", SAND)
     write_exr(folder / "studio.exr", {"RGB": studio()})
+    (folder / "textures").mkdir(exist_ok=True)
+    write_exr(folder / "textures" / "window.exr", {"RGB": window()})
+    write_exr(folder / "textures" / "leather.exr", {"Y": leather_height()})
+    write_exr(folder / "textures" / "wood_height.exr", {"Y": wood_height()})
+    skimage.io.imsave(folder / "textures" / "wood.png", np.uint8(np.round(255 * wood_colour())))
     for name, make in NORMAL_MAPS.items():
         normals = make().normals
         write_exr(folder / "maps" / name, {"R": normals[..., 0], "G": normals[..., 1]})

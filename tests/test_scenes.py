@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 
 from glintbsdf import NormalMap
@@ -126,6 +127,13 @@ def test_assets_are_what_the_script_makes(tmp_path):
             ours, theirs = (NormalMap.load(root / path).normals for root in (tmp_path, SCENES))
             # Halves below 1 are apart by at most 2^-11.
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=2**-11, err_msg=str(path))
+        elif path.parent.name == "textures" and path.suffix == ".exr":
+            ours, theirs = (OpenEXR.File(str(r / path)).channels() for r in (tmp_path, SCENES))
+            for name, channel in ours.items():
+                # Neighbouring halves
+                np.testing.assert_allclose(
+                    channel.pixels, theirs[name].pixels, rtol=2**-10, atol=2**-10, err_msg=str(path)
+                )
 
 
 def read_ply(filename):
