@@ -106,6 +106,19 @@ def test_smooth_lobe_of_a_hand_over(variant):
     assert_same(manifold(hand_over=4.0), rough())
 
 
+@pytest.mark.parametrize("plugin", ["glint_elements", "glint_mip"])
+def test_smooth_lobe_has_the_intrinsic_roughness(variant, plugin):
+    """Squared roughness adds up: that of the map, and twice the variance of a lobe's normals."""
+    sigma_r = 0.1
+    ours = {"type": plugin, "data": mi.TensorXf(MAP.normals), "sigma_r": sigma_r}
+    if plugin == "glint_mip":
+        ours |= {"patch_size": 32, "output_size": 128}
+    alpha = (np.sqrt(alpha**2 + 2 * sigma_r**2) for alpha in MAP.roughness())
+    assert_same(
+        ours, {**rough(), **dict(zip(("alpha_u", "alpha_v"), map(float, alpha), strict=True))}
+    )
+
+
 def test_smooth_lobe_of_a_flat_map(variant):
     """Mitsuba's smallest roughness, 1e-4, and nothing that is not finite."""
     flat = NormalMap(np.zeros((4, 4, 2), np.float32))
