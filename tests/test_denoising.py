@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +17,7 @@ needs_denoiser = pytest.mark.skipif(
     importlib.util.find_spec("mitsuba_oidn") is None,
     reason="the denoiser mitsuba-oidn is not installed",
 )
+SCENES = Path(__file__).parents[1] / "scenes"
 GLINT_PATH = {"type": "glint_path", "max_depth": 6}
 SAMPLER = {"type": "independent", "sample_count": 16}
 
@@ -109,6 +111,23 @@ def test_missing_denoiser(variant, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="pip install mitsuba-oidn"):
         rendering.render(glinting_room(), denoise=True)
+
+
+@needs_denoiser
+def test_sheet_of_the_parts(variant, tmp_path):
+    """The script that shows what is denoised, with the scene made for it."""
+    spec = importlib.util.spec_from_file_location("separated", SCENES / "separated.py")
+    separated = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(separated)
+    size = {"resx": "30", "resy": "20"}
+    scene = rendering.load_scene(SCENES / "interreflection.xml", size)
+    direct, indirect, filtered, whole = separated.pictures(scene, 4)
+    assert np.all(np.array([direct.mean(), indirect.mean(), filtered.mean()]) > 0.01)
+    assert np.allclose(direct + filtered, whole) and not np.allclose(indirect, filtered)
+    assert tuple(separated.sheet([direct, indirect, filtered, whole]).size()) == (60, 40)
+
+    with pytest.raises(SystemExit):
+        separated.main([str(SCENES / "kettle.xml"), "-o", str(tmp_path / "sheet.png")])
 
 
 @needs_denoiser
