@@ -40,8 +40,8 @@ WIDTH = 2.0
 #: A footprint more elongated than this counts as wider in Eq. 8, which limits the cost.
 MAX_ANISOTROPY = 16.0
 
-#: Standard deviations beyond which a lobe's normals are left out: 3e-7 of its mass.
-NORMAL_REACH = 5.5
+#: Standard deviations beyond which a lobe's normals are left out: 4e-5 of its mass at most.
+NORMAL_REACH = 4.5
 
 
 class Mip:
@@ -258,7 +258,7 @@ class Mip:
             )
             first, count, first_2, count_2, y, x, right, origin, sign = walk
             inside = active & (y <= bottom) & (count > 0)
-            axes = mi.Vector2f(sign)
+            axes = mi.Vector2f(sign) if mirrored else mi.Vector2f(1)
             lobe = Lobe(self.words, first, extent, *self.seen(kernel, axes), inside)
             d = (mean - mi.Vector2f(origin)) * axes - lobe.position
             state = add(state, lobe, d, axes, inside)
@@ -309,14 +309,13 @@ class Mip:
             weight, distance = lobe.weight(d)
 
             def contribution():
-                mean, normals = lobe.normals(d, variance)
-                return weight * normals.eval(m - mean)
+                return weight * lobe.normals(d).eval(m, variance)
 
             # The mean moves with the footprint by less than the spread times √distance.
             far = lobe.spread * dr.sqrt(distance) + NORMAL_REACH * dr.sqrt(
                 dr.fma(lobe.spread, lobe.spread, variance)
             )
-            near = active & (dr.squared_norm(m - lobe.mean_normal()) < dr.square(far))
+            near = (weight > 0) & (dr.squared_norm(m - lobe.mean_normal()) < dr.square(far))
             return add_where(density, near, contribution, active), mass + weight
 
         state = mi.Float(0), mi.Float(0)
@@ -356,8 +355,8 @@ class Mip:
         active &= mass > 0
         extent = dr.gather(mi.Float, self.grids.extent, level, active)
         lobe = Lobe(self.words, index, extent, *self.seen(kernel, side), active)
-        mean, normals = lobe.normals(place, dr.square(self.sigma_r))
-        return mean + normals.sample(mi.warp.square_to_std_normal(mi.Point2f(sample2)))
+        normal = mi.warp.square_to_std_normal(mi.Point2f(sample2))
+        return lobe.normals(place).sample(normal, dr.square(self.sigma_r))
 
     def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> tuple[tuple, mi.Float]:
         """Two vectors that make up the footprint's covariance (texels²), in the frame of a copy of

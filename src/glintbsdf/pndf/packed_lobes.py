@@ -17,11 +17,17 @@ sums are of terms of one sign.
 
 from __future__ import annotations
 
+from math import pi
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..gaussian_lobes import Gaussian, cross
+from ..gaussian_lobes import Gaussian
+
+#: Standard deviations of footprint and lobe together beyond which a lobe counts for nothing: 0.2 %
+#: of the mass.
+CUT = 3.5
 
 #: Version of the format, part of the keys of caches.
 VERSION = 1
@@ -111,8 +117,8 @@ class Lobe:
         self.vectors = tuple(self.scaled(v) for v in vectors)
         self.determinant = cross_squared * dr.square(self.xx * self.yy)
         first, second = self.vectors
-        self.trace = dr.squared_norm(first) + dr.squared_norm(second)
-        self.scale = dr.rcp(1 + self.trace + self.determinant)  # 1/|T|
+        trace = dr.squared_norm(first) + dr.squared_norm(second)
+        self.root = dr.rsqrt(1 + trace + self.determinant)  # |T|^(−1/2)
 
     def scaled(self, v: mi.Vector2f) -> mi.Vector2f:
         """L⁻¹ v."""
@@ -120,21 +126,18 @@ class Lobe:
 
     def weight(self, d: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
         """The lobe's mass under a footprint with the centre ``d``, but for a factor common to all
-        lobes of a level, and the squared distance dᵀ T⁻¹ d."""
-        d = self.scaled(d)
-        distance = dr.squared_norm(d)
-        for v in self.vectors:
-            distance = distance + dr.square(cross(v, d))
-        distance = distance * self.scale
-        density = self.xx * self.yy * dr.sqrt(self.scale) * dr.exp(-0.5 * distance)
-        return dr.select(self.active, self.mass * density, 0), distance
+        lobes of a level, and the squared distance dᵀ T⁻¹ d; 0 beyond :data:`CUT`."""
+        distance = scaled_distance(self.vectors, self.scaled(d), self.root)
+        density = self.xx * self.yy * self.root * dr.exp(-0.5 * distance)
+        seen = self.active & (distance < CUT**2)
+        return dr.select(seen, self.mass * density, 0), distance
 
     def mean_normal(self) -> mi.Vector2f:
         """s, the mean normal, wherever the footprint."""
         return normal_of(dr.gather(mi.UInt32, self.words, 8 * self.index + 4, self.active))
 
-    def normals(self, d: mi.Vector2f, variance: mi.Float) -> tuple[mi.Vector2f, Gaussian]:
-        """Mean of the normals seen, and their distribution about it; ``variance``: σ_r²."""
+    def normals(self, d: mi.Vector2f) -> SeenNormals:
+        """The normals that a footprint with the centre ``d`` sees."""
         packed = dr.gather(mi.Vector4u, self.words, 2 * self.index + 1, self.active)
         q_yx, q_yy = halves(packed.y)
         b = mi.Matrix2f(*halves(packed.z), *halves(packed.w))
@@ -145,14 +148,70 @@ class Lobe:
             shift = shift + mi.Vector2f(-v.y, v.x) * cross(v, d)
         # The Cholesky root of Σ T⁻¹, whose determinant is |Σ| / |T|
         first, second = self.vectors
-        xx = dr.fma(first.x, first.x, second.x * second.x) + self.determinant
+        xx = dr.fma(first.x, first.x, dr.fma(second.x, second.x, self.determinant))
         xy = dr.fma(first.x, first.y, second.x * second.y)
-        columns = (
-            dr.sqrt(self.scale / xx) * mi.Vector2f(xx, xy),
-            mi.Vector2f(0, dr.sqrt(self.determinant / xx)),
+        inverse = dr.rsqrt(xx)
+        column = self.root * inverse * mi.Vector2f(xx, xy)
+        height = dr.sqrt(self.determinant) * inverse
+        return SeenNormals(
+            normal_of(packed.x) + dr.square(self.root) * (b @ shift),
+            (b @ column, height * mi.Vector2f(b[0, 1], b[1, 1])),
+            (self.q_xx, q_yx, q_yy),
         )
-        spread = (*(b @ c for c in columns), mi.Vector2f(self.q_xx, q_yx), mi.Vector2f(0, q_yy))
-        return normal_of(packed.x) + self.scale * (b @ shift), Gaussian(spread, variance)
+
+
+class SeenNormals:
+    """A Gaussian of normals with the covariance U Uᵀ + Q Qᵀ + σ_r² I.
+
+    Args:
+        mean (mi.Vector2f): its mean.
+        vectors: the two columns of U, ``mi.Vector2f``: what normals vary over the footprint.
+        rest: Q_xx, Q_yx, Q_yy: what they vary in one place.
+    """
+
+    def __init__(self, mean: mi.Vector2f, vectors: tuple, rest: tuple) -> None:
+        self.mean, self.vectors, self.rest = mean, vectors, rest
+
+    def eval(self, m: mi.Vector2f, variance: mi.Float) -> mi.Float:
+        """The density at ``m``; ``variance``: σ_r² > 0.
+
+        As for positions: scaled by K⁻¹, K Kᵀ = Q Qᵀ + σ_r² I, the covariance is I + U Uᵀ, whose
+        determinant and quadratic form are sums of squares.
+        """
+        q_xx, q_yx, q_yy = self.rest
+        inverse_x = dr.rsqrt(dr.fma(q_xx, q_xx, variance))
+        slope = q_xx * q_yx * dr.square(inverse_x)
+        # q_yx² − slope² / inverse_x², without a difference
+        tilt = q_yx * inverse_x
+        inverse_y = dr.rsqrt(dr.fma(q_yy, q_yy, dr.fma(variance, dr.square(tilt), variance)))
+
+        def scaled(v: mi.Vector2f) -> mi.Vector2f:
+            return mi.Vector2f(v.x * inverse_x, dr.fma(-slope, v.x, v.y) * inverse_y)
+
+        first, second = (scaled(v) for v in self.vectors)
+        trace = dr.squared_norm(first) + dr.squared_norm(second)
+        root = dr.rsqrt(1 + trace + dr.square(cross(first, second)))
+        distance = scaled_distance((first, second), scaled(m - self.mean), root)
+        return inverse_x * inverse_y * root * (0.5 / pi) * dr.exp(-0.5 * distance)
+
+    def sample(self, normal: mi.Vector2f, variance: mi.Float) -> mi.Vector2f:
+        """Draw from it, given two standard normal numbers."""
+        q_xx, q_yx, q_yy = self.rest
+        vectors = (*self.vectors, mi.Vector2f(q_xx, q_yx), mi.Vector2f(0, q_yy))
+        return self.mean + Gaussian(vectors, variance).sample(normal)
+
+
+def cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
+    """z component of the cross product."""
+    return dr.fma(a.x, b.y, -(a.y * b.x))
+
+
+def scaled_distance(vectors: tuple, d: mi.Vector2f, root: mi.Float) -> mi.Float:
+    """dᵀ (I + V Vᵀ)⁻¹ d for the columns V, ``root`` being the determinant to the power −1/2."""
+    distance = dr.squared_norm(d)
+    for v in vectors:
+        distance = dr.fma(cross(v, d), cross(v, d), distance)
+    return distance * dr.square(root)
 
 
 def low(word: mi.UInt32) -> mi.Float:
