@@ -248,14 +248,18 @@ class SmithMasking:
 
     def smith_lambda(self, w: mi.Vector3f, footprint: Footprint, active: mi.Bool) -> mi.Float:
         """Λ(w) ≥ 0 of the facets under the footprint, such that ``G1(w) = 1 / (1 + Λ(w))``."""
-        raise NotImplementedError
+        return self.smith_lambdas([w], footprint, active)[0]
+
+    def smith_lambdas(self, directions: list, footprint: Footprint, active: mi.Bool) -> list:
+        """As :meth:`smith_lambda` for several directions. A subclass overrides either of the two:
+        this one where directions share what is found under the footprint."""
+        return [self.smith_lambda(w, footprint, active) for w in directions]
 
     def eval(
         self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint, active: mi.Bool
     ) -> mi.Float:
         """The factor G in [0, 1] for two directions of the upper hemisphere."""
-        lambda_i = self.smith_lambda(wi, footprint, active)
-        lambda_o = self.smith_lambda(wo, footprint, active)
+        lambda_i, lambda_o = self.smith_lambdas([wi, wo], footprint, active)
         if self.height_correlated:
             return dr.rcp(1 + lambda_i + lambda_o)
         return dr.rcp((1 + lambda_i) * (1 + lambda_o))

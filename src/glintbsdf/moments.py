@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import ceil, floor, log2, sqrt
 from typing import NamedTuple
 
@@ -157,11 +158,10 @@ def all_texels(normals, texels: tuple[Axis, Axis], axes: tuple[Axis, Axis]):
     return dr.gather(mi.Vector2f, normals, index)
 
 
-def quad_averages(moments: Callable, normals, axes: tuple[Axis, Axis]):
-    """Moments averaged over each quad between four texels, and the axes of the quads' centres.
+def quad_averages(over_quad: Callable, normals, axes: tuple[Axis, Axis]):
+    """What ``over_quad`` makes of the normals at the corners of each quad between four texels.
 
-    Over the two triangles of a quad the projected normal is linear. The rule of the three midpoints
-    of edges integrates its quadratic polynomials exactly, and slopes are almost linear in it.
+    Returns that and the axes of the quads' centres.
     """
     # Where the map is not periodic there is a constant quad beyond each border.
     quads = tuple(
@@ -175,7 +175,7 @@ def quad_averages(moments: Callable, normals, axes: tuple[Axis, Axis]):
         mi.Int(i) if axis.periodic else mi.Int(i) - 1
         for i, axis in zip((index // quads[1].count, index % quads[1].count), axes, strict=True)
     )
-    n0, n1, n2, n3 = (
+    corners = [
         dr.gather(
             mi.Vector2f,
             normals,
@@ -183,10 +183,20 @@ def quad_averages(moments: Callable, normals, axes: tuple[Axis, Axis]):
         )
         for i in (0, 1)
         for j in (0, 1)
-    )
+    ]
+    return over_quad(corners), quads
+
+
+def midpoint_rule(moments: Callable, corners: list) -> list:
+    """Averages over a quad of moments of its normals, by the midpoints of its triangles' edges.
+
+    Over the two triangles of a quad the projected normal is linear. The rule integrates its
+    quadratic polynomials exactly, and slopes are almost linear in it.
+    """
+    n0, n1, n2, n3 = corners
     edges = ((n0, n1, 1), (n0, n2, 1), (n1, n2, 2), (n1, n3, 1), (n2, n3, 1))
     parts = [[weight / 6 * x for x in moments(0.5 * (a + b))] for a, b, weight in edges]
-    return [sum(part[1:], part[0]) for part in zip(*parts, strict=True)], quads
+    return [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
 
 
 class Grid(NamedTuple):
@@ -242,12 +252,16 @@ class MomentPyramid:
         data (mi.TensorXf): projected normals, H×W×2. Derivatives flow through it.
         wrap_mode (str): what lies beyond the map's border.
         moments: function of projected normals (``mi.Vector2f``) that returns a list of ``mi.Float``
-            whose averages are wanted, any number of them.
+            whose averages are wanted, any number of them. None for a chain without the texels
+            themselves, for footprints no narrower than level 1.
         finish: function from the averages of a sample of the chain to what is stored there and
             interpolated; by default the averages themselves.
         max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
+        over_quad: function of the normals at the corners of a quad that returns the averages over
+            it; by default that of ``moments`` by :func:`midpoint_rule`.
 
     Attributes:
+        first, top (int): finest and coarsest level.
         nbytes (int): memory of the chain.
     """
 
@@ -255,9 +269,10 @@ class MomentPyramid:
         self,
         data: mi.TensorXf,
         wrap_mode: str,
-        moments: Callable,
+        moments: Callable | None,
         finish: Callable = lambda averages: averages,
         max_anisotropy: float = 16.0,
+        over_quad: Callable | None = None,
     ) -> None:
         self.height, self.width, _ = data.shape
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
@@ -265,11 +280,14 @@ class MomentPyramid:
         normals, rows, columns = self.one_period(data)
         texels = Axis(rows, 0.0, 1.0, self.periodic), Axis(columns, 0.0, 1.0, self.periodic)
         axes = tuple(level_axis(n, 1.0, self.periodic) for n in (rows, columns))
-        stored, shapes = [finish(moments(all_texels(normals, texels, axes)))], [axes]
-        level, axes = quad_averages(moments, normals, texels)
+        stored, shapes = [], []
+        if moments is not None:
+            stored.append(finish(moments(all_texels(normals, texels, axes))))
+            shapes.append(axes)
+        level, axes = quad_averages(over_quad or partial(midpoint_rule, moments), normals, texels)
         variance = 1 / 12  # of a quad, along each axis
-        self.top = 0
-        while len(shapes) == 1 or max(rows, columns) > level_sigma(self.top):
+        self.first, self.top = 1 - len(shapes), 0
+        while len(shapes) < 2 or max(rows, columns) > level_sigma(self.top):
             self.top += 1
             sigma = level_sigma(self.top)
             spacing = 2.0 ** max(0, floor(log2(sigma * SPACING)))
@@ -326,7 +344,7 @@ class MomentPyramid:
     #  Lookup
     # --------------------------------------------------------------------------------------------
 
-    def average(self, footprint) -> list:
+    def average(self, footprint, active: bool | mi.Bool = True) -> list:
         """What is stored, averaged over a footprint: one ``mi.Float`` per channel.
 
         ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
@@ -338,10 +356,11 @@ class MomentPyramid:
         # The coarsest level that is fine enough, with half of what interpolating adds at most.
         level = dr.clip(
             dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1,
-            0,
+            self.first,
             self.top - 1,
         )
         grids = [self.grid(level), self.grid(level + 1)]
+        steps = dr.select(active, steps, -1)  # none at all, as they go from −steps to steps
         step = major * step
 
         # What derivatives flow through is part of the loop's state: they do not find it otherwise.
@@ -359,11 +378,12 @@ class MomentPyramid:
             max_iterations=-1,
             label="taps",
         )[5:]
+        weights = dr.select(active, weights, 1)
         return [total / weights for total in totals]
 
     def grid(self, level) -> Grid:
         """The samples of a level (``mi.Float``)."""
-        index = mi.UInt32(level)
+        index = mi.UInt32(level - self.first)
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
         return Grid(

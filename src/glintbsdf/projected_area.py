@@ -34,6 +34,8 @@ are sorted by normal, do not apply. See :class:`ProjectedArea`.
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -47,6 +49,9 @@ from .pndf.manifold import TexelMesh, add_where, cross, effective_triangle
 
 #: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
 HORIZON = 1e-15
+
+#: Lowest height of a normal that counts in a slope: of a vertical facet it would be infinite.
+LOWEST = 1e-3
 
 # ------------------------------------------------------------------------------------------------
 #  A triangle that is visible as a whole
@@ -314,9 +319,8 @@ def clipped_mean(corners: Corners, w_z, order: int):
 # ------------------------------------------------------------------------------------------------
 
 #: Footprints that touch no more quads than this are smaller than what is constant on a triangle:
-#: the mean is taken over POINTS² points of equal weight instead.
+#: the mean is taken over points of the kernel instead.
 FEW_QUADS = 25
-POINTS = 8
 
 #: Footprints that touch more quads than this see one quad of each square of 2×2, 4×4, … instead,
 #: at a place that differs from square to square, which bounds a footprint's cost. The error of P is
@@ -328,7 +332,22 @@ MANY_QUADS = 4096
 ORDERS = ((0.05, 2), (0.5, 3), (2.1, 6))
 
 
-class ProjectedArea:
+class FootprintArea:
+    """P(ω) of the facets under a footprint; what the two estimates of it share."""
+
+    def eval(self, w: mi.Vector3f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """P(ω) ≥ 0 for a unit vector with ω_z ≥ 0; at most ω_z + the mean slope's length.
+
+        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
+        """
+        return self.areas([w], footprint, active)[0]
+
+    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
+        """As :meth:`eval` for several directions, which share what is found under the footprint."""
+        raise NotImplementedError
+
+
+class ProjectedArea(FootprintArea):
     """P(ω) of the facets under a footprint, by the sum of Eq. 12.
 
     The kernel is constant on each triangle. What the box weighs of a quad between four texels is
@@ -336,8 +355,8 @@ class ProjectedArea:
     lie on those of quads. The other kernels are taken at the triangle's centroid. The weights are
     divided by their sum, so that the projected area of flat facets is exact, and P(z) = 1.
 
-    Footprints of a few texels would see the triangles' size in this: for them P is the mean over a
-    grid of points of the kernel, whose normals the texel mesh interpolates.
+    Footprints of a few texels would see the triangles' size in this: for them see
+    :func:`mean_over_points`.
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
@@ -362,61 +381,38 @@ class ProjectedArea:
 
     def triangles(self, row, column, active):
         """The effective triangles of a stored quad, each as first corner and two edges."""
-        n0, n1, n2, n3 = self.mesh.quad_normals(row, column, active)
-        centre, epsilon = 0.5 * (n1 + n2), self.mesh.epsilon
-        return (
-            effective_triangle(n0, n1, n2, centre, epsilon),
-            effective_triangle(n3, n2, n1, centre, epsilon),
-        )
+        return quad_triangles(self.mesh.quad_normals(row, column, active), self.mesh.epsilon)
 
-    def eval(self, w: mi.Vector3f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """P(ω) ≥ 0 for a unit vector with ω_z ≥ 0; at most ω_z + the mean slope's length.
-
-        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
-        """
+    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
         kernel = self.mesh.texel_kernel(footprint)
         active = mi.Bool(active)
         few = kernel.touched_quads() <= FEW_QUADS
-        return dr.select(
-            few,
-            self.mean_over_points(w, kernel, active & few),
-            self.mean_over_triangles(w, kernel, active & ~few),
-        )
+        by_points = mean_over_points(self.mesh, kernel, directions, active & few)
+        by_triangles = self.mean_over_triangles(directions, kernel, active & ~few)
+        return [dr.select(few, *pair) for pair in zip(by_points, by_triangles, strict=True)]
 
     def __repr__(self) -> str:
         return "analytic"
 
-    def mean_over_points(self, w, kernel, active):
-        """The mean of max(m̃·ω, 0)/m_z over a grid of points of the kernel."""
-
-        def body(k, total):
-            u = (mi.Float(k % POINTS) + 0.5) / POINTS, (mi.Float(k // POINTS) + 0.5) / POINTS
-            m = self.mesh.normal_at(kernel.mean + kernel.sample(mi.Point2f(*u)), active)
-            z = dr.safe_sqrt(1 - dr.squared_norm(m))
-            seen = dr.maximum(facing(m, z, w), 0) / dr.maximum(z, 1e-3)
-            return k + 1, total + dr.select(active, seen, 0)
-
-        state = (mi.UInt32(0), mi.Float(0))
-        total = dr.while_loop(
-            state, lambda k, _: active & (k < POINTS**2), body, max_iterations=-1, label="points"
-        )[1]
-        return total / POINTS**2
-
-    def mean_over_triangles(self, w, kernel, active):
-        """The weighted mean over the triangles of Eq. 12."""
+    def mean_over_triangles(self, directions, kernel, active):
+        """The weighted mean over the triangles of Eq. 12, for each direction."""
         mean = mi.Vector2f(kernel.mean)
 
-        def add(x, y, row, column, active, area, mass):
+        def add(x, y, row, column, active, mass, *areas):
             corner = mi.Vector2f(x, y) - mean
             triangles = self.triangles(row, column, active)
             for triangle, centroid in zip(triangles, (1 / 3, 2 / 3), strict=True):
                 weight = dr.select(active, triangle_weight(kernel, corner, centroid), 0)
-                seen = self.triangle(triangle, w, active & (weight > 0))
-                area, mass = dr.fma(weight, seen, area), mass + weight
-            return area, mass
+                counts = active & (weight > 0)
+                seen = [self.triangle(triangle, w, counts) for w in directions]
+                areas = [dr.fma(weight, x, area) for x, area in zip(seen, areas, strict=True)]
+                mass += weight
+            return mass, *areas
 
-        area, mass = every_stratum(self.mesh.lattice, kernel, add, active)
-        return area / dr.select(mass > 0, mass, 1)
+        sums = [mi.Float(0) for _ in range(1 + len(directions))]
+        mass, *areas = every_stratum(self.mesh.lattice, kernel, add, sums, active)
+        mass = dr.select(mass > 0, mass, 1)
+        return [area / mass for area in areas]
 
     def triangle(self, triangle, w, active):
         """Mean over one effective triangle of max(m̃·ω, 0)/m_z."""
@@ -437,6 +433,16 @@ class ProjectedArea:
         )
 
 
+def quad_triangles(normals, epsilon):
+    """Both effective triangles of a quad with the normals n0…n3: first corner and two edges."""
+    n0, n1, n2, n3 = normals
+    centre = 0.5 * (n1 + n2)
+    return (
+        effective_triangle(n0, n1, n2, centre, epsilon),
+        effective_triangle(n3, n2, n1, centre, epsilon),
+    )
+
+
 def triangle_weight(kernel: TexelKernel, corner, centroid: float):
     """Weight of a triangle of the quad at ``corner`` (texels from the footprint's centre).
 
@@ -451,12 +457,12 @@ def triangle_weight(kernel: TexelKernel, corner, centroid: float):
     return overlap(corner.x, kernel.reach_u) * overlap(corner.y, kernel.reach_v)
 
 
-def every_stratum(lattice: Lattice, kernel: TexelKernel, add, active):
+def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
     """Sum over the quads under the kernel, or one quad of each square of quads if they are many.
 
-    Calls ``add(x, y, row, column, active, area, mass)`` with the quad's position and where it is
-    stored; it returns the new ``(area, mass)``. Rows of squares are followed only as far as the
-    kernel reaches, whatever the footprint's shape.
+    Calls ``add(x, y, row, column, active, *sums)`` with the quad's position and where it is stored;
+    it returns the new sums. Rows of squares are followed only as far as the kernel reaches,
+    whatever the footprint's shape.
     """
     mean = mi.Vector2f(kernel.mean)
     squares = kernel.touched_quads() * (1 / MANY_QUADS)
@@ -473,23 +479,96 @@ def every_stratum(lattice: Lattice, kernel: TexelKernel, add, active):
         start, stop = kernel.row_extent(top, top + mi.Float(side))
         return square(mean.x + start), square(mean.x + stop)
 
-    def body(i, j, last, active, area, mass):
+    def body(i, j, last, active, *sums):
         shift_x, shift_y, _ = pcg3d(mi.UInt32(i), mi.UInt32(j), mi.UInt32(side))
         x = i * side + mi.Int(shift_x >> 8) % side
         y = j * side + mi.Int(shift_y >> 8) % side
-        area, mass = add(x, y, lattice.y.locate(y)[1], lattice.x.locate(x)[1], active, area, mass)
+        sums = add(x, y, lattice.y.locate(y)[1], lattice.x.locate(x)[1], active, *sums)
         new_row = i >= last
         j = dr.select(new_row, j + 1, j)
         first, new_last = extent(j)
         i, last = dr.select(new_row, first, i + 1), dr.select(new_row, new_last, last)
-        return i, j, last, active & (j <= bottom), area, mass
+        return i, j, last, active & (j <= bottom), *sums
 
     top = square(mean.y - kernel.reach_v)
     first, last = extent(top)
-    state = (first, top + 0, last, mi.Bool(active), mi.Float(0), mi.Float(0))
+    state = (first, top + 0, last, mi.Bool(active), *sums)
     return dr.while_loop(
         state, lambda *state: state[3], body, max_iterations=-1, label="every stratum"
     )[4:]
+
+
+# ------------------------------------------------------------------------------------------------
+#  The smallest footprints
+# ------------------------------------------------------------------------------------------------
+
+#: Points of the kernel over which the mean is taken, Fibonacci numbers, for footprints that touch
+#: no more quads than TINY_QUADS and for larger ones; and the fractional part of the golden ratio,
+#: which spreads them evenly. On maps whose normals jump from texel to texel a furnace then reflects
+#: at most 1.02 of what it receives; with the numbers below these it is 1.2 and 8.6.
+TINY_QUADS, POINTS_OF_TINY, POINTS = 4, 34, 55
+GOLDEN = (5**0.5 - 1) / 2
+
+#: Ω of the GGX area (:func:`ggx_area`) over the variance of slopes which are uniformly distributed
+#: over an interval: with it, both see the same at grazing angles.
+UNIFORM = 0.75
+
+
+def mean_over_points(mesh: TexelMesh, kernel: TexelKernel, directions: list, active) -> list:
+    """P(ω) for each direction as the mean over points of the kernel, all of equal weight.
+
+    A point stands for a cell of the kernel, of the area 1/(N k), over which the slopes vary by the
+    triangle's Jacobian: it has the projected area of this spread, not of a single facet, so that
+    what faces ω in a corner of the cell is not missed.
+    """
+    tiny = kernel.touched_quads() <= TINY_QUADS
+    count, share = (
+        dr.select(tiny, kind(few), kind(many))
+        for kind, few, many in (
+            (mi.UInt32, POINTS_OF_TINY, POINTS),
+            (mi.Float, 1 / POINTS_OF_TINY, 1 / POINTS),
+        )
+    )
+
+    def slope_along(w, m, z, e):
+        """The derivative of ω·m̃/m_z along an edge of the normal triangle."""
+        flat = mi.Vector2f(w.x, w.y)
+        return dr.fma(dr.dot(flat, m), dr.dot(m, e) / (z * z), dr.dot(flat, e)) / z
+
+    def body(k, *totals):
+        x, y = ((mi.Float(k) + 0.5) * step for step in (share, GOLDEN))
+        offset = kernel.sample(mi.Point2f(x, y - dr.floor(y)))
+        m, e1, e2 = mesh.frame_at(kernel.mean + offset, active)
+        z = dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
+        new = []
+        for w, total in zip(directions, totals, strict=True):
+            mean = dr.fma(w.x, m.x, w.y * m.y) / z + w.z
+            d1, d2 = (slope_along(w, m, z, e) for e in (e1, e2))
+            spread = UNIFORM * share * variance_of_cells(kernel, offset, d1, d2)
+            new.append(total + dr.select(active, ggx_area(mean, spread), 0))
+        return k + 1, *new
+
+    totals = dr.while_loop(
+        (mi.UInt32(0), *[mi.Float(0) for _ in directions]),
+        lambda k, *_: active & (k < count),
+        body,
+        max_iterations=-1,
+        label="points",
+    )[1:]
+    return [total * share for total in totals]
+
+
+def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
+    """N times the variance, over the cell of a point, of what changes by ``d1``, ``d2`` per texel.
+
+    The cell has the kernel's own shape and the area 1/(N k): once the kernel is round, a variance
+    of area/12 along either axis.
+    """
+    if kernel.kernel == "box":
+        return (dr.square(d1 * kernel.reach_u) + dr.square(d2 * kernel.reach_v)) / 3
+    stretch = kernel.sigma_u_given_v / kernel.sigma_v
+    across = dr.square(d1) * stretch + dr.square(dr.fma(d1, kernel.shear, d2)) / stretch
+    return across / (12 * kernel.value(offset))
 
 
 # ------------------------------------------------------------------------------------------------
@@ -499,11 +578,21 @@ def every_stratum(lattice: Lattice, kernel: TexelKernel, add, active):
 #: Directions of the half circle at which the fit is made.
 AZIMUTHS = 8
 
-#: Lowest height of a normal that counts in a slope: of a vertical facet it would be infinite.
-LOWEST = 1e-3
+#: Footprints that touch no more quads than this are no matter of averages over a texel or more:
+#: the fit gives way to points of the kernel. A round one has a standard deviation of 1.2 texels.
+FINE_QUADS = 64
 
 
-class GgxFit:
+def ggx_area(mean, rough):
+    """P' of a GGX distribution of slopes, ½ (w̄ + √(w̄² + ω_xyᵀ Ω ω_xy)); 0 for w̄ < 0 and Ω = 0.
+
+    ``mean``: w̄; ``rough``: the square ω_xyᵀ Ω ω_xy.
+    """
+    root = dr.sqrt(dr.maximum(dr.fma(mean, mean, rough), 1e-20))
+    return 0.5 * dr.select(mean >= 0, mean + root, rough / dr.select(mean >= 0, 1, root - mean))
+
+
+class GgxFit(FootprintArea):
     r"""P(ω) of the GGX distribution of slopes that fits the facets under a footprint.
 
     The paper's Eq. 13, with the bracket that its print lost, is
@@ -517,14 +606,20 @@ class GgxFit:
     of a plane of slope s̄, as no distribution's is.
 
     At grazing angles, ω_z = 0, this is linear in Ω, ``4 P (P − w̄) = ω_xyᵀ Ω ω_xy``, which gives Ω
-    by least squares over :data:`AZIMUTHS` directions; the other half of the circle says the same,
-    as P(−ω) = P(ω) − w̄. Mean slope and P at grazing angles are averages over the footprint, taken
-    by a :class:`~glintbsdf.moments.MomentPyramid`: levels are Gaussians of growing width, so a
-    round footprint mixes the two next in size, and a stretched one sums lookups along its axis.
-    What is stored and interpolated is (s̄, Ω + s̄ s̄ᵀ), the raw moments of two facets ±√Ω: slopes
-    that differ between the samples of a level then count as roughness.
+    by least squares over :data:`AZIMUTHS` directions, and no less than that in any of them
+    (:func:`fit`); the other half of the circle says the same, as P(−ω) = P(ω) − w̄. Mean slope and
+    P at grazing angles are averages over the footprint, taken by a
+    :class:`~glintbsdf.moments.MomentPyramid`: levels are Gaussians of growing width, so a round
+    footprint mixes the two next in size, and a stretched one sums lookups along its axis. What is
+    stored and interpolated is (s̄, Ω + s̄ s̄ᵀ), the raw moments of two facets ±√Ω: slopes that differ
+    between the samples of a level then count as roughness, and as P' is a concave function of the
+    raw moments, what was not below P at the samples is not below it between them.
 
-    Built in less time than a cache would take to read. The footprint is always Gaussian.
+    Footprints of little more than a texel (:data:`FINE_QUADS`) see :func:`mean_over_points`
+    instead: there a distribution fitted to a wider place reflects more than it receives wherever a
+    few facets face a grazing direction.
+
+    Built in less time than a cache would take to read. Beyond a texel the footprint is Gaussian.
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
@@ -537,21 +632,26 @@ class GgxFit:
     def parameters_changed(self) -> None:
         """Fit anew to the data of the mesh."""
         self.pyramid = MomentPyramid(
-            self.mesh.data, self.mesh.normal_map.wrap_mode, grazing_areas, fit
+            self.mesh.data,
+            self.mesh.normal_map.wrap_mode,
+            None,
+            over_quad=partial(grazing_areas, epsilon=self.mesh.epsilon),
+            finish=fit,
         )
 
-    def eval(self, w: mi.Vector3f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """P'(ω) ≥ 0 for a unit vector with ω_z ≥ 0.
-
-        ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
-        """
-        slope_x, slope_y, xx, xy, yy = self.pyramid.average(footprint)
-        leaning = dr.fma(slope_x, w.x, slope_y * w.y)
-        raw = w.x * w.x * xx + 2 * w.x * w.y * xy + w.y * w.y * yy
-        rough = dr.maximum(dr.fma(-leaning, leaning, raw), 0)
-        mean = w.z + leaning
-        root = dr.sqrt(dr.maximum(dr.fma(mean, mean, rough), 1e-20))
-        return 0.5 * dr.select(mean >= 0, mean + root, rough / dr.select(mean >= 0, 1, root - mean))
+    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
+        kernel = self.mesh.texel_kernel(footprint)
+        active = mi.Bool(active)
+        fine = kernel.touched_quads() <= FINE_QUADS
+        by_points = mean_over_points(self.mesh, kernel, directions, active & fine)
+        slope_x, slope_y, xx, xy, yy = self.pyramid.average(footprint, active & ~fine)
+        areas = []
+        for w, mean_of_points in zip(directions, by_points, strict=True):
+            leaning = dr.fma(slope_x, w.x, slope_y * w.y)
+            raw = w.x * w.x * xx + 2 * w.x * w.y * xy + w.y * w.y * yy
+            rough = dr.maximum(dr.fma(-leaning, leaning, raw), 0)
+            areas.append(dr.select(fine, mean_of_points, ggx_area(w.z + leaning, rough)))
+        return areas
 
     @property
     def nbytes(self) -> int:
@@ -568,15 +668,56 @@ def azimuths() -> list[tuple[float, float]]:
     return [(float(np.cos(angle)), float(np.sin(angle))) for angle in angles]
 
 
-def grazing_areas(m: mi.Vector2f) -> list:
-    """The slope of a facet, and its projected area in every horizontal direction."""
-    slope = m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
-    areas = [dr.maximum(dr.fma(slope.x, x, slope.y * y), 0) for x, y in azimuths()]
-    return [slope.x, slope.y, *areas]
+def grazing_areas(normals, epsilon: float) -> list:
+    """The mean slope of a quad's facets, and their projected area in every horizontal direction.
+
+    ``normals``: n0…n3 at its corners. Over each of the effective triangles the slope counts as
+    linear, so that only the corners' slopes matter.
+    """
+    totals = None
+    for first, e1, e2 in quad_triangles(normals, epsilon):
+        slopes = [
+            m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
+            for m in (first, first + e1, first + e2)
+        ]
+        mean = (slopes[0] + slopes[1] + slopes[2]) / 3
+        areas = [mean_positive([dr.fma(s.x, x, s.y * y) for s in slopes]) for x, y in azimuths()]
+        values = [mean.x, mean.y, *areas]
+        totals = (
+            values
+            if totals is None
+            else [0.5 * (a + b) for a, b in zip(totals, values, strict=True)]
+        )
+    return totals
+
+
+def mean_positive(corners: list):
+    """Mean over a triangle of max(f, 0) for a linear f with these values at the corners.
+
+    Where f changes its sign around one corner, of the value a, while b and c are the others, the
+    part of a's sign is a triangle and adds a³/(3 (a − b)(a − c)).
+    """
+    x, y, z = corners
+    low, high = dr.minimum(dr.minimum(x, y), z), dr.maximum(dr.maximum(x, y), z)
+    middle = dr.maximum(dr.minimum(x, y), dr.minimum(dr.maximum(x, y), z))
+
+    def cut_off(a, b, c):
+        divisor = 3 * (a - b) * (a - c)
+        return dr.select(divisor > 0, a * a * a / dr.select(divisor > 0, divisor, 1), 0)
+
+    mean = (x + y + z) / 3
+    alone_above = dr.select(high > 0, cut_off(high, middle, low), 0)
+    alone_below = mean - dr.select(low < 0, cut_off(low, middle, high), 0)
+    return dr.select(middle > 0, alone_below, alone_above)
 
 
 def fit(averages: list) -> list:
-    """The raw moments (s̄_x, s̄_y, R_xx, R_xy, R_yy) of averages of :func:`grazing_areas`."""
+    """The raw moments (s̄_x, s̄_y, R_xx, R_xy, R_yy) of averages of :func:`grazing_areas`.
+
+    Least squares leave Ω too small in some directions, even negative, and a surface that shows too
+    small an area reflects more than it receives. One after the other, the directions for which Ω
+    falls short raise it, along themselves by what is missing.
+    """
     slope_x, slope_y, *areas = averages
     directions = azimuths()
     squares = [
@@ -587,8 +728,10 @@ def fit(averages: list) -> list:
     xx, xy, yy = (
         sum((float(c) * v for c, v in zip(row, squares, strict=True)), mi.Float(0)) for row in solve
     )
-    lean_xx, lean_xy, lean_yy = slope_x * slope_x, slope_x * slope_y, slope_y * slope_y
-    return [slope_x, slope_y, xx + lean_xx, xy + lean_xy, yy + lean_yy]
+    for square, (x, y) in zip(squares, directions, strict=True):
+        missing = dr.maximum(square - (x * x * xx + 2 * x * y * xy + y * y * yy), 0)
+        xx, xy, yy = xx + missing * x * x, xy + missing * x * y, yy + missing * y * y
+    return [slope_x, slope_y, xx + slope_x * slope_x, xy + slope_x * slope_y, yy + slope_y**2]
 
 
 class ProjectedAreaMasking(SmithMasking):
@@ -609,9 +752,12 @@ class ProjectedAreaMasking(SmithMasking):
     def parameters_changed(self) -> None:
         self.area.parameters_changed()
 
-    def smith_lambda(self, w: mi.Vector3f, footprint, active: mi.Bool) -> mi.Float:
-        area = self.area.eval(w, footprint, active)
-        return dr.maximum(area / dr.maximum(w.z, 1e-12) - 1, 0)
+    def smith_lambdas(self, directions: list, footprint, active: mi.Bool) -> list:
+        areas = self.area.areas(directions, footprint, active)
+        return [
+            dr.maximum(area / dr.maximum(w.z, 1e-12) - 1, 0)
+            for w, area in zip(directions, areas, strict=True)
+        ]
 
     def __repr__(self) -> str:
         return f"{self.area}, height_correlated = {self.height_correlated}"

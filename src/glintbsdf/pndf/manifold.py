@@ -63,6 +63,11 @@ def effective_triangle(a, b, c, centre, epsilon):
 
 def normal_in_quad(l1, l2, normals, epsilon):
     """The normal n(u) of a quad's effective triangles at the place (``l1``, ``l2``) ∈ [0, 1]²."""
+    return frame_in_quad(l1, l2, normals, epsilon)[0]
+
+
+def frame_in_quad(l1, l2, normals, epsilon):
+    """As :func:`normal_in_quad`, and the columns of the Jacobian J(u): ``(n, ∂n/∂l1, ∂n/∂l2)``."""
     n0, n1, n2, n3 = normals
     upper = l1 + l2 < 1
     l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
@@ -73,7 +78,8 @@ def normal_in_quad(l1, l2, normals, epsilon):
         0.5 * (n1 + n2),
         epsilon,
     )
-    return a + e1 * l1 + e2 * l2
+    sign = dr.select(upper, mi.Float(1), -1)
+    return a + e1 * l1 + e2 * l2, e1 * sign, e2 * sign
 
 
 # ------------------------------------------------------------------------------------------------
@@ -211,12 +217,16 @@ class TexelMesh:
 
     def normal_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> mi.Vector2f:
         """The projected normal n(u) of the effective triangles at the position ``u``, in texels."""
+        return self.frame_at(u, active)[0]
+
+    def frame_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> tuple:
+        """As :meth:`normal_at`, and the columns of the Jacobian J(u): ``(n, ∂n/∂u_x, ∂n/∂u_y)``."""
         column, row = floor_int(u.x), floor_int(u.y)
         l1, l2 = u.x - column, u.y - row
         n0, n1, n2, n3 = self.quad_normals(
             self.lattice.y.locate(row)[1], self.lattice.x.locate(column)[1], active
         )
-        return normal_in_quad(l1, l2, (n0, n1, n2, n3), self.epsilon)
+        return frame_in_quad(l1, l2, (n0, n1, n2, n3), self.epsilon)
 
     def texel_kernel(self, footprint) -> TexelKernel:
         """k(u − x) of Eq. 2 for this map."""
