@@ -173,9 +173,9 @@ from __future__ import annotations
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
-from glintbsdf.parameters import Parameters
-from glintbsdf.pndf import Elements
+from glintbsdf.microfacet import BeckmannMasking, MapBeckmannMasking
+from glintbsdf.parameters import MAP_SOURCES, Parameters
+from glintbsdf.pndf import Elements, Flakes
 
 
 class GlintElements(GlintBSDF):
@@ -184,17 +184,31 @@ class GlintElements(GlintBSDF):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
+        parameters.only_one_of(MAP_SOURCES, ("flake_density",))
         sigma_r = parameters.number("sigma_r", 0.005)
-        self.pndf = Elements(
-            parameters.normal_map(),
-            sigma_r,
-            step=parameters.number("step", 0.5),
-            curved=parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
-            owner=self.owner,
-        )
-        masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
-        self.masking = MapBeckmannMasking(self.pndf) if masking == "beckmann" else None
-        self.smooth = MapBeckmannLobe(self.pndf)
+        if "flake_density" in props:
+            self.pndf = Flakes(
+                parameters.number("flake_density", 0.0),
+                parameters.number("flake_alpha", 0.2),
+                sigma_r,
+                props.get("seed", 0),
+                self.owner,
+            )
+        else:
+            self.pndf = Elements(
+                parameters.normal_map(),
+                sigma_r,
+                parameters.number("step", 0.5),
+                parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
+                self.owner,
+            )
+        self.masking = None
+        if parameters.choice("masking", "beckmann", ("beckmann", "none")) == "beckmann":
+            self.masking = (
+                BeckmannMasking(mi.Vector2f(self.pndf.alpha**2))
+                if isinstance(self.pndf, Flakes)
+                else MapBeckmannMasking(self.pndf)
+            )
 
 
 mi.register_bsdf("glint_elements", lambda props: GlintElements(props))

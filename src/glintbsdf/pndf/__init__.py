@@ -3,6 +3,7 @@
 from .clustered import ClusteredManifold
 from .elements import Elements
 from .filtered import Filtered
+from .flakes import Flakes
 from .grid import Grid
 from .hand_over import HandOver
 from .manifold import Manifold
@@ -13,6 +14,7 @@ __all__ = [
     "ClusteredManifold",
     "Elements",
     "Filtered",
+    "Flakes",
     "Grid",
     "HandOver",
     "Manifold",

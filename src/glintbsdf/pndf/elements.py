@@ -29,7 +29,7 @@ from ..normalmap import NormalMap
 from .quad_lists import QuadLists, every_quad
 
 #: Of the lists; part of their name in the cache.
-VERSION = 2
+VERSION = 3
 
 #: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
 FEW_CELLS = 25
@@ -44,6 +44,10 @@ MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
 
 #: Seeds per cell along an axis, at most: the loop over those of a cell is unrolled.
 MAX_SEEDS = 4
+
+#: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
+#: takes half of its 1120 MB then at a step of half a texel, and a quarter of that at one texel.
+BYTES_PER_CELL = 42, 90
 
 #: Attempts of the sampler, of which nine in ten succeed.
 MAX_ATTEMPTS = 64
@@ -146,8 +150,17 @@ class Mixture:
         """
         raise NotImplementedError
 
+    def is_small(self, kernel: TexelKernel, steps: mi.Float) -> mi.Bool:
+        """Whether to sum all elements under the footprint, and with them W; ``steps`` is its minor
+        standard deviation in steps from one element to the next."""
+        raise NotImplementedError
+
+    def sum_all(self, kernel: TexelKernel, add: Callable, active, zero):
+        """Sum over all cells with elements under the footprint; see :func:`every_quad`."""
+        raise NotImplementedError
+
     def mass(self, kernel: TexelKernel) -> mi.Float:
-        """W: mass of all elements under the footprint, without a cut."""
+        """W: mass of all elements under a large footprint, without a cut."""
         raise NotImplementedError
 
     def draw_seed(self, position, random_x, random_y, active) -> tuple:
@@ -172,7 +185,7 @@ class Mixture:
         steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
         cut = cut_of_sums(steps)
         kernel.cut_at(dr.sqrt(cut))
-        few = kernel.touched_quads() <= FEW_CELLS
+        few = self.is_small(kernel, steps)
         cut = dr.select(few, cut, cut_of_lists(steps))
         kernel.cut_at(dr.sqrt(cut))
         return kernel, few, cut
@@ -207,7 +220,7 @@ class Mixture:
                 total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * alike), weight)
             return sums + dr.select(cell[-1], total, 0)
 
-        density, mass = every_quad(self.lattice, kernel, add_both, active & few, mi.Vector2f(0))
+        density, mass = self.sum_all(kernel, add_both, active & few, mi.Vector2f(0))
         listed = active & ~few & self.lists.covers(m)
         density = density + self.lists.visit(m, kernel, add, listed)
         # Under the fade, this share of a Gaussian is left.
@@ -434,6 +447,12 @@ class Elements(Mixture):
 
         return seen
 
+    def is_small(self, kernel, steps):
+        return kernel.touched_quads() <= FEW_CELLS
+
+    def sum_all(self, kernel, add, active, zero):
+        return every_quad(self.lattice, kernel, add, active, zero)
+
     def element(self, x, y, active):
         cells, places = zip(
             *(axis.cell_of(seed) for axis, seed in zip(self.axes, (x, y), strict=True)),
@@ -508,7 +527,10 @@ class Elements(Mixture):
 
         lower, upper = self.extent()
         normals = self.data.numpy().reshape(-1, 2)
-        return QuadLists.build(self.lattice, triangles, normals, (lower, upper))
+        allowed = BYTES_PER_CELL[self.seeds > 1]
+        return QuadLists.build(
+            self.lattice, triangles, normals, (lower, upper), bytes_per_quad=allowed
+        )
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
         """The rectangle (lower, upper) that holds the bounds of all cells."""

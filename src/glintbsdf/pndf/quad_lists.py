@@ -17,6 +17,7 @@ import numpy as np
 
 from ..lattice import BLOCK, Lattice, floor_int
 from ..progress import progress
+from ..reach import Reach
 
 SHIFT = BLOCK.bit_length() - 1  # quad to block
 
@@ -73,14 +74,15 @@ def every_quad(lattice: Lattice, kernel, add, active, zero=None):
     )[5]
 
 
-def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active) -> mi.Float:
+def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=None) -> mi.Float:
     """Sum over the entries of the lists that the kernel touches; see :meth:`QuadLists.visit`.
 
     The lattice's blocks have the side ``1 << shift``, a number or one per lane (``mi.Int``).
     ``run_of(row of blocks, first block, last block, active)`` returns begin and end of a run of
     consecutive entries, ``place_of(entry, first row of the row of blocks, active)`` the row and
     column that an entry stands for, and whatever else ``add`` is to be given. One flat loop,
-    because lanes that walk nested loops wait for each other at the end of every inner one.
+    because lanes that walk nested loops wait for each other at the end of every inner one. The sum
+    begins with ``zero``, as in :func:`every_quad`.
     """
     columns, rows = lattice.x, lattice.y
     mean = mi.Vector2f(kernel.mean)
@@ -133,7 +135,8 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active) -> mi.F
     none = mi.Int(0)
     y = floor_int(mean.y - kernel.reach_v)
     run = (mi.UInt32(0), mi.UInt32(0), none, none - 1, y, y, none, none, none)
-    state = (*(type(v)(v) for v in run), mi.Bool(active), mi.Float(0))
+    zero = mi.Float(0) if zero is None else zero
+    state = (*(type(v)(v) for v in run), mi.Bool(active), zero)
     return dr.while_loop(
         state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
     )[-1]
@@ -231,16 +234,45 @@ class NormalCells:
         return mi.Float(x.astype(np.float32)), mi.Float(y.astype(np.float32))
 
 
-class Window(NamedTuple):
-    """A rectangle of blocks of quads: ``(first, number)`` of its rows, and of its columns."""
+class Span(NamedTuple):
+    """Blocks along one axis: ``count`` from ``first`` on, block 0 following the last of ``all``."""
 
-    rows: tuple[int, int]
-    columns: tuple[int, int]
+    first: int
+    count: int
+    all: int
+
+    def place(self, block):
+        """Which of the span a block is (``mi.UInt32``)."""
+        place = block - self.first
+        if self.first + self.count > self.all:
+            place = dr.select(block < self.first, place + self.all, place)
+        return place
+
+    def block(self, place):
+        """The block at a place of the span (``mi.UInt32``)."""
+        block = place + self.first
+        if self.first + self.count > self.all:
+            block = dr.select(block >= self.all, block - self.all, block)
+        return block
+
+
+class Window(NamedTuple):
+    """A rectangle of blocks of quads."""
+
+    rows: Span
+    columns: Span
 
     @staticmethod
     def whole(lattice: Lattice) -> Window:
         """All blocks."""
-        return Window((0, lattice.y.blocks), (0, lattice.x.blocks))
+        return Window(*(Span(0, axis.blocks, axis.blocks) for axis in (lattice.y, lattice.x)))
+
+    @staticmethod
+    def touched(lattice: Lattice, reach: Reach) -> Window:
+        """The blocks that footprints within the reach touch."""
+        touched = lattice.y.touched_blocks(*reach.rows), lattice.x.touched_blocks(*reach.columns)
+        axes = lattice.y, lattice.x
+        return Window(*(Span(*t, a.blocks) for t, a in zip(touched, axes, strict=True)))
 
 
 class QuadLists:
@@ -272,30 +304,30 @@ class QuadLists:
         """Whether any quad may show the normal ``m``."""
         return self.cells.covers(m)
 
-    def visit(self, m, kernel, add, active) -> mi.Float:
-        """Sum over all quads that may show ``m`` under the kernel.
+    def visit(self, m, kernel, add, active, zero=None) -> mi.Float:
+        """Sum over all quads that may show ``m`` under the kernel, beginning with ``zero``.
 
         Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice,
         ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
         it returns the new ``density``. Sums are differentiable in both modes.
         """
-        (first_row, _), (first_column, columns) = self.window
-        count, width = self.cells.divisions**2, columns + 1
+        rows, columns = self.window
+        count, width = self.cells.divisions**2, columns.count + 1
         cell = self.cells.cell(m, active)
 
         def run_of(block_row, first, last, active):
-            list_index = (block_row - first_row) * count + cell
+            list_index = rows.place(block_row) * count + cell
             start = dr.gather(mi.UInt32, self.start, list_index, active)
             return tuple(
                 start + self.offset[list_index * width + k, active]
-                for k in (first - first_column, last + 1 - first_column)
+                for k in (columns.place(first), columns.place(last) + 1)
             )
 
         def quad_of(entry, row, found):
             quad = mi.Int(self.entries[entry, found])
             return row + (quad & (BLOCK - 1)), quad >> SHIFT
 
-        return walk(self.lattice, SHIFT, kernel, run_of, quad_of, add, active)
+        return walk(self.lattice, SHIFT, kernel, run_of, quad_of, add, active, zero)
 
     # --------------------------------------------------------------------------------------------
     #  Building
@@ -303,16 +335,23 @@ class QuadLists:
 
     @staticmethod
     def build(
-        lattice: Lattice, triangles, normals: np.ndarray, bounds, window: Window | None = None
+        lattice: Lattice,
+        triangles,
+        normals: np.ndarray,
+        bounds,
+        window: Window | None = None,
+        bytes_per_quad: float = BYTES_PER_QUAD,
     ) -> dict[str, np.ndarray]:
         """Build the arrays, in two passes over the lattice, or a window of it: count, then fill.
 
         ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
         and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
-        rectangle (lower, upper), inside which all triangles lie.
+        rectangle (lower, upper), inside which all triangles lie; ``bytes_per_quad`` the memory
+        allowed.
         """
         window = window or Window.whole(lattice)
-        return Builder(BlocksOfQuads(lattice, triangles, window), normals, bounds).arrays()
+        blocks = BlocksOfQuads(lattice, triangles, window)
+        return Builder(blocks, normals, bounds, bytes_per_quad).arrays()
 
 
 def reaches(triangle, centre, half):
@@ -344,7 +383,8 @@ class BlocksOfQuads:
 
     def __init__(self, lattice: Lattice, triangles, window: Window) -> None:
         self.lattice, self.triangles_of_quad = lattice, triangles
-        (self.first_row, self.rows), (self.first_column, self.columns) = window
+        self.window = window
+        self.rows, self.columns = window.rows.count, window.columns.count
         self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
 
     def count(self, block_row, block_column):
@@ -353,14 +393,14 @@ class BlocksOfQuads:
 
     def triangles(self, block_row, block_column, quad, active):
         """Whether the ``quad``-th of a block exists, and its two triangles."""
-        row = (self.first_row + block_row) * BLOCK + (quad >> SHIFT)
-        column = (self.first_column + block_column) * BLOCK + (quad & (BLOCK - 1))
+        row = self.window.rows.block(block_row) * BLOCK + (quad >> SHIFT)
+        column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
         exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
         return exists, self.triangles_of_quad(row, column, exists)
 
     def entry(self, block_row, block_column, quad):
         """What the lists say of the ``quad``-th of a block."""
-        column = (self.first_column + block_column) * BLOCK + (quad & (BLOCK - 1))
+        column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
         return (column << SHIFT) | (quad >> SHIFT)
 
 
