@@ -98,6 +98,8 @@ Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), s
 
 from __future__ import annotations
 
+from math import pi
+
 import drjit as dr
 import mitsuba as mi
 
@@ -105,8 +107,9 @@ from glintbsdf.bsdf import FootprintBSDF
 from glintbsdf.diffuse import FacetDiffuse, OrenNayarDiffuse
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf.manifold import TexelMesh
+from glintbsdf.reach import Reach
 
-METHODS = {"manifold": FacetDiffuse, "oren_nayar": OrenNayarDiffuse}
+METHODS = ("manifold", "oren_nayar")
 
 
 class GlintDiffuse(FootprintBSDF):
@@ -115,9 +118,11 @@ class GlintDiffuse(FootprintBSDF):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
-        self.mesh = TexelMesh(parameters.normal_map(), owner=self.owner)
+        self.normal_map = parameters.normal_map()
+        self.mesh = TexelMesh(self.normal_map, owner=self.owner)
         self.reflectance = parameters.spectrum("reflectance", 0.5, maximum=1.0)
-        self.method = METHODS[parameters.choice("method", "manifold", tuple(METHODS))](self.mesh)
+        self.method_name = parameters.choice("method", "manifold", METHODS)
+        self.method = None
         self.m_flags = (
             mi.BSDFFlags.DiffuseReflection
             | mi.BSDFFlags.FrontSide
@@ -125,6 +130,17 @@ class GlintDiffuse(FootprintBSDF):
             | mi.BSDFFlags.Anisotropic
         )
         self.m_components = [self.m_flags]
+        if not self.waits:
+            self.build()
+
+    def build(self, reach: Reach | None = None) -> None:
+        if self.method_name == "manifold":
+            self.method = FacetDiffuse(self.mesh)
+        else:
+            self.method = OrenNayarDiffuse(self.mesh, reach)
+
+    def parts(self) -> dict[str, int]:
+        return self.mesh.parts | getattr(self.method, "parts", {})
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.mesh.traverse(callback)
@@ -134,7 +150,7 @@ class GlintDiffuse(FootprintBSDF):
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
         self.mesh.parameters_changed(keys)
-        if not keys or "data" in keys:
+        if self.method is not None and (not keys or "data" in keys):
             self.method.parameters_changed()
 
     def sample(
@@ -168,7 +184,10 @@ class GlintDiffuse(FootprintBSDF):
         # Lanes below the horizon must stay finite: their derivatives would be NaN.
         up = mi.Vector3f(0, 0, 1)
         wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
-        white = self.method.eval(wi, wo, ctx.mode, self.footprint(si), active)
+        footprint = self.footprint(si, active)
+        white = wo.z * (1 / pi)  # as long as it waits to be built
+        if self.method is not None:
+            white = self.method.eval(wi, wo, ctx.mode, footprint, active)
         value = dr.select(active, self.reflectance.eval(si, active) * white, 0)
         pdf = dr.select(active, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
         return mi.mueller.depolarizer(value) if mi.is_polarized else value, pdf

@@ -162,6 +162,8 @@ Reference: Tomas Akenine-Möller et al., "Real-Time Rendering", 4th edition, sec
 
 from __future__ import annotations
 
+from functools import partial
+
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
@@ -169,6 +171,7 @@ from glintbsdf.errors import check
 from glintbsdf.footprint import Footprint
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf.filtered import METHODS, Filtered, LobeMasking, VisibleNormals
+from glintbsdf.reach import Reach
 from glintbsdf.slope_lobe import DISTRIBUTIONS
 
 
@@ -179,8 +182,10 @@ class GlintFiltered(GlintBSDF):
         super().__init__(props)
         parameters = Parameters(props)
         method = parameters.choice("method", "lean", tuple(METHODS))
-        self.pndf = Filtered(
-            parameters.normal_map(),
+        self.normal_map = parameters.normal_map()
+        self.create = partial(
+            Filtered,
+            self.normal_map,
             method=method,
             alpha=parameters.number("alpha", 0.05),
             distribution=parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
@@ -196,15 +201,24 @@ class GlintFiltered(GlintBSDF):
             masking,
         )
         height_correlated = parameters.boolean("height_correlated", True)
-        self.masking = None
+        self.create_masking = lambda: None
         if masking == "smith":
-            self.masking = LobeMasking(self.pndf, height_correlated, projection=method == "leadr")
+            self.create_masking = lambda: LobeMasking(
+                self.pndf, height_correlated, projection=method == "leadr"
+            )
+        if not self.waits:
+            self.build()
+
+    def build(self, reach: Reach | None = None) -> None:
+        self.pndf = self.create(reach=reach)
+        self.masking = self.create_masking()
 
     def normals(self) -> VisibleNormals:
         return VisibleNormals(self.pndf)
 
-    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
-        return self.pndf.with_lobe(super().footprint(si))
+    def footprint(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Footprint:
+        footprint = super().footprint(si, active)
+        return footprint if self.pndf is None else self.pndf.with_lobe(footprint)
 
 
 mi.register_bsdf("glint_filtered", lambda props: GlintFiltered(props))

@@ -175,6 +175,7 @@ from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf import ClusteredManifold, HandOver, Manifold, TabulatedManifold
 from glintbsdf.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
+from glintbsdf.reach import Reach
 
 MASKINGS = ("ggx_fit", "analytic", "beckmann", "none")
 
@@ -193,29 +194,45 @@ class GlintManifold(GlintBSDF):
             'left out where "max_error" is given',
             threshold,
         )
+        self.normal_map = parameters.normal_map()
+        self.options = {
+            "kernel": parameters.choice("kernel", "gaussian", KERNELS),
+            "epsilon": parameters.number("epsilon", 1e-6),
+            "owner": self.owner,
+        }
+        self.threshold, self.max_error = threshold, max_error
+        self.masking_name = parameters.choice("masking", "ggx_fit", MASKINGS)
+        self.height_correlated = parameters.boolean("height_correlated", True)
+        self.hand_over = parameters.number("hand_over", 0.0)
+        if not self.waits:
+            self.build()
+
+    def build(self, reach: Reach | None = None) -> None:
         create = Manifold
-        if threshold:
-            create = partial(ClusteredManifold, threshold=threshold)
-        elif max_error:
-            create = partial(TabulatedManifold, max_error=max_error)
-        self.pndf = create(
-            parameters.normal_map(),
-            kernel=parameters.choice("kernel", "gaussian", KERNELS),
-            epsilon=parameters.number("epsilon", 1e-6),
-            owner=self.owner,
-        )
-        masking = parameters.choice("masking", "ggx_fit", MASKINGS)
-        height_correlated = parameters.boolean("height_correlated", True)
-        self.masking = {
-            "ggx_fit": lambda: ProjectedAreaMasking(GgxFit(self.pndf), height_correlated),
-            "analytic": lambda: ProjectedAreaMasking(ProjectedArea(self.pndf), height_correlated),
-            "beckmann": lambda: MapBeckmannMasking(self.pndf, height_correlated),
+        if self.threshold:
+            create = partial(ClusteredManifold, threshold=self.threshold)
+        elif self.max_error:
+            create = partial(TabulatedManifold, max_error=self.max_error)
+        mesh = create(self.normal_map, reach=reach, **self.options)
+        masking = {
+            "ggx_fit": lambda: ProjectedAreaMasking(GgxFit(mesh, reach), self.height_correlated),
+            "analytic": lambda: ProjectedAreaMasking(ProjectedArea(mesh), self.height_correlated),
+            "beckmann": lambda: MapBeckmannMasking(mesh, self.height_correlated),
             "none": lambda: None,
-        }[masking]()
-        self.smooth = MapBeckmannLobe(self.pndf)
-        hand_over = parameters.number("hand_over", 0.0)
-        if hand_over:
-            self.pndf = HandOver(self.pndf, hand_over, self.owner)
+        }
+        self.masking = masking[self.masking_name]()
+        self.smooth = MapBeckmannLobe(mesh)
+        self.pndf = mesh
+        if self.hand_over and (reach is None or reach.largest > self.hand_over):
+            self.pndf = HandOver(mesh, self.hand_over, self.owner, reach)
+
+    def left_out(self) -> list[str]:
+        features = {
+            "clusters: threshold is 0": self.threshold,
+            "tables: max_error is 0": self.max_error,
+            "smooth lobe: hand_over is 0": self.hand_over,
+        }
+        return [name for name, value in features.items() if not value] + super().left_out()
 
 
 mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))

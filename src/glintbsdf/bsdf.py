@@ -15,7 +15,9 @@ import mitsuba as mi
 from . import microfacet
 from .errors import check
 from .footprint import Footprint, is_literal_zero
+from .normalmap import NormalMap
 from .parameters import Parameters
+from .reach import Gate, Reach, Recorder, must_wait
 from .separation import asks_for_smooth_lobes
 
 
@@ -26,18 +28,40 @@ class FootprintBSDF(mi.BSDF):
         owner, name (str): type and id of the plugin, as errors and warnings name them.
         to_uv (mi.ScalarAffineTransform3f): transform of UV space.
         footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
+        normal_map (NormalMap): the map, of a BSDF that can tell what of it is asked for.
+        watch (Recorder | Gate): who looks at every footprint; nobody by default.
+        waits (bool): whether it was made in a block of :func:`~glintbsdf.reach.waiting`.
 
     Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
     """
 
+    normal_map: NormalMap | None = None
+    watch: Recorder | Gate | None = None
+
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        self.waits = must_wait(self)
         self.owner, self.name = props.plugin_name(), props.id()
         parameters = Parameters(props)
         self.to_uv = parameters.to_uv()
         self.footprint_sigma = mi.Float(parameters.number("footprint_sigma", 0.5))
         self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
         self.warned_of_point_footprint = False
+
+    def build(self, reach: Reach | None = None) -> None:
+        """Make what queries within ``reach`` need, or any query; whatever there was, goes.
+
+        A subclass that can do so late overrides this, and calls it at its constructor's end unless
+        it ``waits``. Here nothing is left to do.
+        """
+
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of what has been built, bytes."""
+        return {}
+
+    def left_out(self) -> list[str]:
+        """What the parameters leave out of what is built and evaluated, and why, in words."""
+        return []
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
@@ -76,12 +100,15 @@ class FootprintBSDF(mi.BSDF):
     ) -> mi.Float:
         return self.eval_pdf(ctx, si, wo, active)[1]
 
-    def footprint(self, si: mi.SurfaceInteraction3f) -> Footprint:
-        """The footprint at ``si`` in the UV space of the map."""
+    def footprint(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Footprint:
+        """The footprint at ``si`` in the UV space of the map, for a query of the active lanes."""
         footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
         if footprint.is_known_to_be_zero() and not is_literal_zero(self.footprint_sigma):
             self.warn_of_point_footprint()
-        return footprint if self.to_uv == type(self.to_uv)() else footprint.transformed(self.to_uv)
+        identity = self.to_uv == type(self.to_uv)()  # Mitsuba's != is never true of transforms
+        if not identity:
+            footprint = footprint.transformed(self.to_uv)
+        return footprint if self.watch is None else self.watch(footprint, mi.Bool(active))
 
     def warn_of_point_footprint(self) -> None:
         """Say, once, that nothing tells how large a pixel is."""
@@ -136,7 +163,8 @@ class GlintBSDF(FootprintBSDF):
 
     Attributes:
         pndf: the P-NDF: ``eval(m, footprint, active)``, the density D over the disk of projected
-            normals; ``traverse`` and ``parameters_changed``.
+            normals; ``traverse`` and ``parameters_changed``. None as long as it waits to be built:
+            a smooth surface of the map's overall roughness then takes its place.
         masking: :class:`~glintbsdf.microfacet.SmithMasking`, or None for none.
         smooth: :class:`~glintbsdf.microfacet.BeckmannLobe` of the roughness that all glints have
             together, which takes their place in a ``separation.smooth_context()``; None (the
@@ -149,6 +177,8 @@ class GlintBSDF(FootprintBSDF):
     Raises :class:`~glintbsdf.errors.ParameterError` for values that are not allowed.
     """
 
+    pndf: object = None
+    masking: microfacet.SmithMasking | None = None
     smooth: microfacet.BeckmannLobe | None = None
 
     def __init__(self, props: mi.Properties) -> None:
@@ -166,7 +196,8 @@ class GlintBSDF(FootprintBSDF):
         self.m_components = [self.m_flags]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        self.pndf.traverse(callback)
+        if self.pndf is not None:
+            self.pndf.traverse(callback)
         super().traverse(callback)
         if self.fresnel is not None:
             self.fresnel.traverse(callback)
@@ -177,15 +208,19 @@ class GlintBSDF(FootprintBSDF):
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
-        self.pndf.parameters_changed(keys)
+        if self.pndf is not None:
+            self.pndf.parameters_changed(keys)
         for part in (self.masking, self.smooth):
             if part is not None:
                 part.parameters_changed()
 
     def facets(self, ctx: mi.BSDFContext) -> Facets:
         """The glints, or their smooth counterpart where ``ctx`` asks for it."""
-        if self.smooth is not None and asks_for_smooth_lobes(ctx):
-            smooth = self.smooth
+        smooth = self.smooth if asks_for_smooth_lobes(ctx) else None
+        if self.pndf is None:
+            alpha = (max(alpha, 1e-4) for alpha in self.normal_map.roughness())
+            smooth = microfacet.BeckmannLobe(mi.Vector2f(*alpha))
+        if smooth is not None:
             return Facets(smooth.density, smooth.normals, smooth.masking, self.mean_tint)
         return Facets(self.density, self.normals(), self.masking, self.tint)
 
@@ -207,7 +242,7 @@ class GlintBSDF(FootprintBSDF):
 
         # Draw a normal and reflect about it. One that does not point up, or reflects below the
         # horizon, is an invalid sample: its mass is missing from the pdf as well.
-        footprint = self.footprint(si)
+        footprint = self.footprint(si, active)
         facets = self.facets(ctx)
         m = facets.normals.sample(wi, footprint, sample1, sample2, active)
         wo = mi.reflect(wi, mi.Normal3f(m))
@@ -243,7 +278,7 @@ class GlintBSDF(FootprintBSDF):
         up = mi.Vector3f(0, 0, 1)
         wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
         m = microfacet.half_vector(wi, wo)
-        footprint = self.footprint(si)
+        footprint = self.footprint(si, active)
         facets = self.facets(ctx)
         density = facets.density(si, m, footprint, active)
         value = microfacet.reflected_value(density, wi.z)
@@ -315,6 +350,22 @@ class GlintBSDF(FootprintBSDF):
             if self.fresnel is not None:
                 spectrum = spectrum * self.fresnel.reflectance(dr.dot(wo, m), si, active)
         return dr.select(active, spectrum, 0)
+
+    def parts(self) -> dict[str, int]:
+        if self.pndf is None:
+            return {}
+        parts = dict(getattr(self.pndf, "parts", {"P-NDF": self.pndf.nbytes}))
+        if self.pndf.nbytes > sum(parts.values()):
+            parts["else"] = self.pndf.nbytes - sum(parts.values())
+        return parts | getattr(self.masking, "parts", {})
+
+    def left_out(self) -> list[str]:
+        features = {
+            "masking: none": self.masking,
+            "Fresnel reflectance: a perfect mirror": self.fresnel,
+            "tint: no specular_reflectance": self.specular_reflectance,
+        }
+        return [name for name, feature in features.items() if feature is None]
 
     def members(self) -> dict[str, object]:
         return {

@@ -1,4 +1,4 @@
-"""The command line: ``glintbsdf render``, ``pndf``, ``synthesise`` and ``doctor``.
+"""The command line: ``glintbsdf render``, ``pndf``, ``inspect``, ``synthesise`` and ``doctor``.
 
 Only what concerns the terminal is here; the work is done in other modules.
 """
@@ -17,7 +17,7 @@ import click
 import drjit as dr
 import mitsuba as mi
 
-from . import __version__, llvm, pndf_plot, rendering, synthesis
+from . import __version__, inspection, llvm, pndf_plot, rendering, synthesis
 from .doctor import examine
 from .normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from .progress import progress
@@ -187,6 +187,12 @@ def _define_option(meaning: str):
     help="Denoise the indirect light; direct light, and so all glints, stay as they are. Needs the "
     'integrator "glint_path".',
 )
+@click.option(
+    "--trim",
+    is_flag=True,
+    help="Build no more of the maps' structures than the scene asks for, which a survey with few "
+    "samples finds out. The image is the same.",
+)
 @_define_option("Parameter of the scene; may be repeated.")
 def render(
     scene: Path,
@@ -195,6 +201,7 @@ def render(
     spp: int | None,
     seed: int,
     denoise: bool,
+    trim: bool,
     definitions: dict[str, str],
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
@@ -204,12 +211,53 @@ def render(
     _activate(variant)
     path = output or scene.with_suffix(".exr")
     with rendering.replacing(path) as unfinished:
-        # Plugins show the progress of what they build while the scene loads.
-        loaded = rendering.load_scene(scene, definitions)
-        with progress("Rendering") as report:
-            bitmap = rendering.render(loaded, spp, seed, report, denoise)
+        if trim:
+            bitmap = _render_trimmed(scene, definitions, spp, seed, denoise)
+        else:
+            # Plugins show the progress of what they build while the scene loads.
+            loaded = rendering.load_scene(scene, definitions)
+            with progress("Rendering") as report:
+                bitmap = rendering.render(loaded, spp, seed, report, denoise)
         rendering.save(bitmap, unfinished)
     click.echo(path)
+
+
+def _render_trimmed(
+    scene: Path, definitions: dict[str, str], spp: int | None, seed: int, denoise: bool
+) -> mi.Bitmap:
+    """Render by structures that a survey has trimmed, and tell where they have not sufficed."""
+    inspected = inspection.load(scene, definitions)
+
+    def render(check) -> mi.Bitmap:
+        with progress("Rendering") as report:
+            return rendering.render(
+                inspected.scene, spp, seed, lambda done: (check(), report(done)), denoise
+            )
+
+    bitmap, sufficed = inspection.render_trimmed(inspected, render, spp)
+    if not sufficed:
+        click.echo("Trimmed structures did not suffice: built in full, rendered again.", err=True)
+    return bitmap
+
+
+@commands.command()
+@click.argument("scene", type=_file)
+@_variant_option
+@click.option(
+    "--spp",
+    type=click.IntRange(min=1),
+    help="Samples per pixel, on which footprints depend.  [default: the scene's]",
+)
+@_define_option("Parameter of the scene; may be repeated.")
+def inspect(scene: Path, variant: str, spp: int | None, definitions: dict[str, str]) -> None:
+    """Report what the glint BSDFs of the Mitsuba scene SCENE are asked for, and what they build.
+
+    The part of each map and the sizes of footprints are what paths of the scene's own sensor and
+    integrator have met, later bounces included; "--trim" is what "render --trim" would build.
+    """
+    _activate(variant)
+    findings = inspection.inspect(inspection.load(scene, definitions), spp)
+    click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")
 
 
 @commands.command()

@@ -14,6 +14,7 @@ import mitsuba as mi
 from .moments import MomentPyramid
 from .pndf.manifold import TexelMesh
 from .projected_area import LOWEST, ProjectedArea
+from .reach import Reach
 
 
 class FacetDiffuse:
@@ -55,15 +56,28 @@ class OrenNayarDiffuse:
 
     Args:
         mesh (TexelMesh): gives the normals; its triangles play no part.
+        reach (Reach): what will be asked for, see ``MomentPyramid``.
+
+    Attributes:
+        parts (dict[str, int]): memory of each part, bytes.
     """
 
-    def __init__(self, mesh: TexelMesh) -> None:
-        self.mesh = mesh
+    def __init__(self, mesh: TexelMesh, reach: Reach | None = None) -> None:
+        self.mesh, self.reach = mesh, reach
         self.parameters_changed()
+
+    @property
+    def parts(self) -> dict[str, int]:
+        return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.pyramid.nbytes}
 
     def parameters_changed(self) -> None:
         """Average anew the data of the mesh."""
-        self.pyramid = MomentPyramid(self.mesh.data, self.mesh.normal_map.wrap_mode, slope_moments)
+        self.pyramid = MomentPyramid(
+            self.mesh.data,
+            self.mesh.normal_map.wrap_mode,
+            slope_moments,
+            reach=self.reach,
+        )
 
     def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
         """``f cosθ_o``; zero where either direction is below the mean facet. Reciprocal."""

@@ -68,7 +68,8 @@ class Axis:
     def touched_blocks(self, first: int, last: int) -> tuple[int, int]:
         """The stored blocks in which the positions from ``first`` to ``last`` (texels) lie.
 
-        Returns the first and their number: all, where the positions cross the stored border.
+        Returns the first and their number. Past the last stored block of a map that repeats or
+        mirrors comes block 0.
         """
         if self.clamped:
             first = min(max(first + self.block, 0), self.quads - self.block)
@@ -77,9 +78,12 @@ class Axis:
                 first = 0
             if last >= self.quads - self.block:
                 last = self.quads - 1
-        elif first < 0 or last >= self.quads:
-            return 0, self.blocks
-        return first // self.block, last // self.block - first // self.block + 1
+        else:
+            if last - first >= self.quads - self.block:
+                return 0, self.blocks
+            first, last = first % self.quads, last % self.quads
+        first, last = first // self.block, last // self.block
+        return first, (last - first) % self.blocks + 1
 
     def following(self, x, index):
         """Where the quad after ``x`` is stored, given where ``x`` is."""

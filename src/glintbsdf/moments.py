@@ -37,6 +37,7 @@ import mitsuba as mi
 
 from .kernels import TexelKernel
 from .lattice import floor_int
+from .reach import Reach
 
 #: Standard deviation of a level over that of the one before.
 RATIO = 2 ** (1 / 3)
@@ -71,6 +72,14 @@ TINY = 1e-12
 def level_sigma(level: int) -> float:
     """Standard deviation of the Gaussian of a level ≥ 1, texels."""
     return RATIO ** (level - 1)
+
+
+def level_below(variance):
+    """The coarsest level fine enough for a lookup of this variance (texels²), which may be < 0.
+
+    Fine enough with half of what interpolating adds at most.
+    """
+    return dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1
 
 
 # ------------------------------------------------------------------------------------------------
@@ -199,11 +208,43 @@ def midpoint_rule(moments: Callable, corners: list) -> list:
     return [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
 
 
+def samples_within(axis: Axis, first: float, last: float) -> tuple[int, int]:
+    """First and number of the samples that an interpolation between two positions (texels) needs.
+
+    Those of a periodic axis need not lie within its period.
+    """
+    low, high = (floor((x - axis.origin) / axis.spacing) for x in (first, last))
+    low, high = low - 1, high + 2  # the sample after, and one more on either side for rounding
+    if not axis.periodic:
+        low, high = (min(max(k, 0), axis.count - 1) for k in (low, high))
+    return low, high - low + 1
+
+
+def samples(window) -> int:
+    """Number of samples in a window, ``(first, number)`` of its rows and of its columns."""
+    (_, rows), (_, columns) = window
+    return rows * columns
+
+
+def cut_out(level: list, axes: tuple[Axis, Axis], window) -> list:
+    """The part of a level in a window, which may lie across the border."""
+    (top, rows), (left, columns) = window
+    if window == tuple((0, axis.count) for axis in axes):
+        return level
+    index = dr.arange(mi.UInt32, rows * columns)
+    row = axes[0].wrapped(top + mi.Int(index // columns))
+    column = axes[1].wrapped(left + mi.Int(index % columns))
+    index = row * axes[1].count + column
+    return [dr.gather(mi.Float, channel, index) for channel in level]
+
+
 class Grid(NamedTuple):
-    """Where a level's samples are: its first, samples per texel, their number and its inverse, all
-    for x and y; the level's variance (texels²), and half of the squared spacing."""
+    """Where a level's samples are: the first of a whole level, though it may not be stored, samples
+    stored per row, samples per texel, their number and its inverse, these for x and y; the level's
+    variance (texels²), and half of the squared spacing."""
 
     offset: mi.UInt32
+    pitch: mi.UInt32
     scale: mi.Vector2f
     count: mi.Vector2f
     inverse_count: mi.Vector2f
@@ -259,6 +300,8 @@ class MomentPyramid:
         max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
         over_quad: function of the normals at the corners of a quad that returns the averages over
             it; by default that of ``moments`` by :func:`midpoint_rule`.
+        reach (Reach): what will be asked for; levels and parts of levels that no such footprint
+            needs are left out. What lies within the reach has the same averages to the last bit.
 
     Attributes:
         first, top (int): finest and coarsest level.
@@ -273,33 +316,69 @@ class MomentPyramid:
         finish: Callable = lambda averages: averages,
         max_anisotropy: float = 16.0,
         over_quad: Callable | None = None,
+        reach: Reach | None = None,
     ) -> None:
         self.height, self.width, _ = data.shape
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
         self.periodic = wrap_mode != "clamp"
         normals, rows, columns = self.one_period(data)
         texels = Axis(rows, 0.0, 1.0, self.periodic), Axis(columns, 0.0, 1.0, self.periodic)
-        axes = tuple(level_axis(n, 1.0, self.periodic) for n in (rows, columns))
-        stored, shapes = [], []
-        if moments is not None:
-            stored.append(finish(moments(all_texels(normals, texels, axes))))
-            shapes.append(axes)
+        self.first = 0 if moments is not None else 1
+        self.top = self.first + 1
+        while max(rows, columns) > level_sigma(self.top):
+            self.top += 1
+        if reach is not None:  # with a margin for rounding
+            last = self.top - 1
+            self.first = int(dr.clip(level_below(0.998 * reach.smallest**2), self.first, last))
+            last = int(dr.clip(level_below(1.002 * reach.largest**2), self.first, last))
+            self.top = last + 1
+
+        def axes_of(number: int) -> tuple[Axis, Axis]:
+            spacing = 2.0 ** max(0, floor(log2(level_sigma(number) * SPACING)))
+            return tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
+
+        shapes = [axes_of(number) for number in range(self.first, self.top + 1)]
+        windows = self.choose_windows(shapes, reach)
+        stored = []
+
+        def keep(level: list) -> None:
+            k = len(stored)
+            stored.append(finish(cut_out(level, shapes[k], windows[k])))
+
+        if self.first == 0:
+            keep(moments(all_texels(normals, texels, axes_of(0))))
         level, axes = quad_averages(over_quad or partial(midpoint_rule, moments), normals, texels)
         variance = 1 / 12  # of a quad, along each axis
-        self.first, self.top = 1 - len(shapes), 0
-        while len(shapes) < 2 or max(rows, columns) > level_sigma(self.top):
-            self.top += 1
-            sigma = level_sigma(self.top)
-            spacing = 2.0 ** max(0, floor(log2(sigma * SPACING)))
-            target = tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
+        for number in range(1, self.top + 1):
+            sigma, target = level_sigma(number), axes_of(number)
             for along in (0, 1):
                 level = smooth(level, axes, along, target[along], sigma**2 - variance)
                 axes = (target[0], axes[1]) if along == 0 else target
                 dr.eval(level)
             variance = sigma**2
-            stored.append(finish(level))
-            shapes.append(axes)
-        self.store(stored, shapes)
+            if number >= self.first:
+                keep(level)
+        self.store(stored, shapes, windows)
+
+    def choose_windows(self, shapes: list[tuple[Axis, Axis]], reach: Reach | None) -> list:
+        """What to store of each level: ``(first, number)`` of the rows, and of the columns.
+
+        All of all levels, or what lies within the reach, if that is less. It may lie across the
+        border of a periodic level, and is stored as it lies: lookups need not wrap then.
+        """
+        whole = [tuple((0, axis.count) for axis in axes) for axes in shapes]
+        self.wraps = self.periodic
+        if reach is None:
+            return whole
+        ends = reach.rows, reach.columns
+        parts = [
+            tuple(samples_within(axis, *end) for axis, end in zip(axes, ends, strict=True))
+            for axes in shapes
+        ]
+        if sum(map(samples, parts)) >= sum(map(samples, whole)):
+            return whole
+        self.wraps = False
+        return parts
 
     def one_period(self, data):
         """Projected normals, rows and columns of the map, or of the period of a mirrored one."""
@@ -312,8 +391,11 @@ class MomentPyramid:
         mirrored = dr.gather(mi.Vector2f, data.array, row * self.width + column)
         return dr.ravel(mirrored), 2 * self.height, 2 * self.width
 
-    def store(self, levels: list[list], shapes: list[tuple[Axis, Axis]]) -> None:
-        """Lay the levels out one after the other, as records of four numbers, and of one each."""
+    def store(self, levels: list[list], shapes: list[tuple[Axis, Axis]], windows: list) -> None:
+        """Lay the levels out one after the other, as records of four numbers, and of one each.
+
+        ``windows``: of each level ``(first, number)`` of the rows, and of the columns, given.
+        """
         channels = [dr.concat(parts) for parts in zip(*levels, strict=True)]
         dr.eval(channels)
         self.channels = len(channels)
@@ -324,8 +406,14 @@ class MomentPyramid:
             group = group + [zero] * (4 - len(group))
             self.records.append(dr.ravel(mi.Vector4f(group)))
         self.single = channels[0] if channels else None
-        sizes = [rows.count * columns.count for rows, columns in shapes]
-        self.offsets = mi.UInt32([sum(sizes[:k]) for k in range(len(sizes))])
+        sizes = [samples(window) for window in windows]
+        pitches = [columns for _, (_, columns) in windows]
+        # Of the first sample of the whole level: possibly before all, in arithmetic modulo 2³².
+        offsets = [
+            (sum(sizes[:k]) - top * columns - left) % 2**32
+            for k, ((top, _), (left, columns)) in enumerate(windows)
+        ]
+        self.layout = dr.ravel(mi.Vector2u(mi.UInt32(offsets), mi.UInt32(pitches)))
         # index = (position + 1/2) / spacing − 1/2 (+ border), for every level; see level_axis.
         self.grids = dr.ravel(
             mi.Vector4f(
@@ -337,7 +425,7 @@ class MomentPyramid:
                 ]
             )
         )
-        dr.eval(self.records, self.single, self.offsets, self.grids)
+        dr.eval(self.records, self.single, self.layout, self.grids)
         self.nbytes = 4 * sum(sizes) * (4 * len(self.records) + (self.single is not None))
 
     # --------------------------------------------------------------------------------------------
@@ -353,12 +441,7 @@ class MomentPyramid:
         major, variance_major, variance_minor = principal_axes(kernel)
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
         variance, step, steps, sharpness = taps(variance_major, variance)
-        # The coarsest level that is fine enough, with half of what interpolating adds at most.
-        level = dr.clip(
-            dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1,
-            self.first,
-            self.top - 1,
-        )
+        level = dr.clip(level_below(variance), self.first, self.top - 1)
         grids = [self.grid(level), self.grid(level + 1)]
         steps = dr.select(active, steps, -1)  # none at all, as they go from −steps to steps
         step = major * step
@@ -387,7 +470,7 @@ class MomentPyramid:
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
         return Grid(
-            dr.gather(mi.UInt32, self.offsets, index),
+            *dr.gather(mi.Vector2u, self.layout, index),
             mi.Vector2f(scale_x, scale_y),
             mi.Vector2f(columns, rows),
             mi.Vector2f(dr.rcp(columns), dr.rcp(rows)),
@@ -409,14 +492,16 @@ class MomentPyramid:
         place = (position + 0.5) * grid.scale + (-0.5 if self.periodic else BORDER - 0.5)
         corner = dr.floor(place)
         f = place - corner
-        if self.periodic:
+        if self.wraps:
             first = corner - count * dr.floor((corner + 0.5) * grid.inverse_count)
             second = dr.select(first + 1 < count, first + 1, 0)
+        elif self.periodic:
+            first, second = corner, corner + 1
         else:
             first, second = (dr.clip(corner + k, 0, count - 1) for k in (0, 1))
-        columns = mi.UInt32(count.x)
-        rows = [grid.offset + mi.UInt32(y) * columns for y in (first.y, second.y)]
-        index = [row + mi.UInt32(x) for row in rows for x in (first.x, second.x)]
+        (x0, y0), (x1, y1) = (mi.Vector2u(mi.Vector2i(v)) for v in (first, second))
+        rows = [grid.offset + y * grid.pitch for y in (y0, y1)]
+        index = [row + x for row in rows for x in (x0, x1)]
         weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
         averages = []
         for kind, records in [(mi.Vector4f, x) for x in self.records] + (

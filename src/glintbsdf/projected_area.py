@@ -46,6 +46,7 @@ from .lattice import Lattice, floor_int
 from .microfacet import SmithMasking
 from .moments import MomentPyramid
 from .pndf.manifold import TexelMesh, add_where, cross, effective_triangle
+from .reach import Reach
 
 #: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
 HORIZON = 1e-15
@@ -623,20 +624,37 @@ class GgxFit(FootprintArea):
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
+        reach (Reach): what will be asked for; None for anything. Levels that no such footprint
+            needs are left out.
+
+    Attributes:
+        pyramid (MomentPyramid): None where all footprints see :func:`mean_over_points`.
+        parts (dict[str, int]): memory of each part, bytes.
     """
 
-    def __init__(self, mesh: TexelMesh) -> None:
-        self.mesh = mesh
+    def __init__(self, mesh: TexelMesh, reach: Reach | None = None) -> None:
+        self.mesh, self.reach = mesh, reach
         self.parameters_changed()
+
+    @property
+    def parts(self) -> dict[str, int]:
+        if self.pyramid is None:
+            return {}
+        levels = f"{self.pyramid.first} to {self.pyramid.top}"
+        return {f"masking, MIP levels {levels}": self.pyramid.nbytes}
 
     def parameters_changed(self) -> None:
         """Fit anew to the data of the mesh."""
+        self.pyramid = None
+        if self.reach is not None and self.reach.most_quads <= FINE_QUADS:
+            return
         self.pyramid = MomentPyramid(
             self.mesh.data,
             self.mesh.normal_map.wrap_mode,
             None,
             over_quad=partial(grazing_areas, epsilon=self.mesh.epsilon),
             finish=fit,
+            reach=self.reach,
         )
 
     def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
@@ -644,6 +662,8 @@ class GgxFit(FootprintArea):
         active = mi.Bool(active)
         fine = kernel.touched_quads() <= FINE_QUADS
         by_points = mean_over_points(self.mesh, kernel, directions, active & fine)
+        if self.pyramid is None:
+            return by_points
         slope_x, slope_y, xx, xy, yy = self.pyramid.average(footprint, active & ~fine)
         areas = []
         for w, mean_of_points in zip(directions, by_points, strict=True):
@@ -748,6 +768,8 @@ class ProjectedAreaMasking(SmithMasking):
     def __init__(self, area: ProjectedArea | GgxFit, height_correlated: bool = True) -> None:
         super().__init__(height_correlated)
         self.area = area
+
+    parts = property(lambda self: getattr(self.area, "parts", {}))
 
     def parameters_changed(self) -> None:
         self.area.parameters_changed()

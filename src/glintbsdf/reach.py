@@ -59,6 +59,10 @@ class Reach:
         return Reach(columns, rows, self.smallest / MARGIN_SIZE, self.largest * MARGIN_SIZE)
 
 
+#: The reach of a map that nobody asks.
+NOTHING = Reach(columns=(0, -1), rows=(0, -1), smallest=0.0, largest=0.0)
+
+
 # ------------------------------------------------------------------------------------------------
 #  Building later
 # ------------------------------------------------------------------------------------------------
@@ -130,11 +134,11 @@ class Recorder:
         normal_map (NormalMap): the map that is asked.
     """
 
-    NOTHING = -(1 << 30)
+    NEVER = -(1 << 30)
 
     def __init__(self, normal_map: NormalMap) -> None:
         self.normal_map = normal_map
-        self.largest = dr.full(mi.Int, self.NOTHING, 6)
+        self.largest = dr.full(mi.Int, self.NEVER, 6)
         dr.make_opaque(self.largest)
 
     def __call__(self, footprint: Footprint, active: mi.Bool) -> Footprint:
@@ -152,7 +156,7 @@ class Recorder:
     def found(self) -> Reach | None:
         """What all queries together have touched; None if there was none."""
         left, right, top, bottom, minor, major = (int(x) for x in self.largest.numpy())
-        if right == self.NOTHING:
+        if right == self.NEVER:
             return None
         return Reach((-left, right), (-top, bottom), 2 ** (-minor / STEPS), 2 ** (major / STEPS))
 

@@ -70,8 +70,20 @@ def require_uvs(scene: mi.Scene) -> None:
             )
 
 
+def first_sensor(scene: mi.Scene) -> mi.Sensor:
+    """The sensor that a scene is rendered with.
+
+    Raises:
+        ValueError: no sensor, or a mesh without the UVs that its BSDF needs.
+    """
+    if not scene.sensors():
+        raise ValueError("the scene has no sensor")
+    require_uvs(scene)
+    return scene.sensors()[0]
+
+
 @contextmanager
-def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: int = 1) -> Iterator[None]:
+def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: float = 1) -> Iterator[None]:
     """Give all glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel, in the block.
 
     A BSDF whose ``pixel_spread`` is 0 gets the sensor's pixel angle, scaled by 1/√spp as Mitsuba
@@ -126,10 +138,7 @@ def render(
         ModuleNotFoundError: ``denoise``, and no denoiser is installed.
         KeyboardInterrupt: also where Mitsuba itself has caught the signal.
     """
-    if not scene.sensors():
-        raise ValueError("the scene has no sensor")
-    require_uvs(scene)
-    sensor = scene.sensors()[0]
+    sensor = first_sensor(scene)
     sampler = sensor.sampler()
     if spp is not None:
         sampler.set_sample_count(spp)

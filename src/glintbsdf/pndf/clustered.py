@@ -31,6 +31,7 @@ from ..kernels import REACH, SIGMA_MAX
 from ..lattice import BLOCK, Axis, floor_int
 from ..normalmap import NormalMap
 from ..progress import progress
+from ..reach import Reach
 from . import manifold
 from .cluster_fit import fit_clusters
 from .manifold import (
@@ -461,6 +462,8 @@ class ClusteredManifold(Manifold):
         normal_map (NormalMap): the map.
         threshold (float): τ > 0.
         kernel, epsilon, owner: as for :class:`~glintbsdf.pndf.manifold.TexelMesh`.
+        reach: as for :class:`~glintbsdf.pndf.manifold.Manifold`; clusters are made of the whole map
+            all the same.
 
     Attributes:
         ladder (Ladder): the cuts; None where no footprint would use a cluster.
@@ -476,6 +479,7 @@ class ClusteredManifold(Manifold):
         kernel: str = "gaussian",
         epsilon: float = 1e-6,
         owner: str = "ClusteredManifold",
+        reach: Reach | None = None,
     ) -> None:
         check(0 < threshold and isfinite(threshold), owner, "threshold", "a finite number > 0",
               threshold)  # fmt: skip
@@ -485,7 +489,7 @@ class ClusteredManifold(Manifold):
             f"{epsilon!r} {self.threshold!r}"
         )
         self.cached_clusters = lambda build: load_or_build(key, build)
-        super().__init__(normal_map, kernel, epsilon, owner)
+        super().__init__(normal_map, kernel, epsilon, owner, reach)
         self.cached_clusters = lambda build: build()  # of data that change, nothing is kept
 
     def build(self) -> None:
@@ -596,6 +600,6 @@ class ClusteredManifold(Manifold):
         callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)
 
     @property
-    def nbytes(self) -> int:
-        """Memory of vertices and lists, exact and clustered, bytes."""
-        return super().nbytes + (0 if self.ladder is None else self.ladder.nbytes)
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, exact and clustered, bytes."""
+        return {**super().parts, "clusters": 0 if self.ladder is None else self.ladder.nbytes}

@@ -21,6 +21,7 @@ from ..footprint import Footprint
 from ..microfacet import SmithMasking
 from ..moments import MomentPyramid
 from ..normalmap import MAX_SLOPE, NormalMap, check_texels
+from ..reach import Reach
 from ..slope_lobe import DISTRIBUTIONS, SlopeLobe
 
 # ------------------------------------------------------------------------------------------------
@@ -186,6 +187,8 @@ class Filtered:
         distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
         max_anisotropy (float): ≥ 1, see :class:`~glintbsdf.moments.MomentPyramid`.
         owner (str): whom errors name, usually the plugin.
+        reach (Reach): what will be asked; None for anything. MIP levels that no such footprint
+            needs are then left out. Lobes within the reach are the same to the last bit.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
@@ -206,6 +209,7 @@ class Filtered:
         distribution: str = "beckmann",
         max_anisotropy: float = 16.0,
         owner: str = "Filtered",
+        reach: Reach | None = None,
     ) -> None:
         check_choice(owner, "method", method, tuple(METHODS))
         check_choice(owner, "distribution", distribution, DISTRIBUTIONS)
@@ -220,6 +224,7 @@ class Filtered:
         check(max_anisotropy >= 1, owner, "max_anisotropy", "a number ≥ 1", max_anisotropy)
         self.name, self.distribution, self.owner = method, distribution, owner
         self.max_anisotropy, self.wrap_mode = float(max_anisotropy), normal_map.wrap_mode
+        self.reach = reach
         self.alpha = mi.Float(alpha)
         self.check_alpha()
         self.data = mi.TensorXf(normal_map.normals)
@@ -236,7 +241,12 @@ class Filtered:
             {"steeper": z_squared * (1 + MAX_SLOPE**2) < 1},
         )
         self.pyramid = MomentPyramid(
-            self.data, self.wrap_mode, self.method.moments, self.method.store, self.max_anisotropy
+            self.data,
+            self.wrap_mode,
+            self.method.moments,
+            self.method.store,
+            self.max_anisotropy,
+            reach=self.reach,
         )
 
     def check_alpha(self) -> None:
@@ -289,6 +299,11 @@ class Filtered:
     def nbytes(self) -> int:
         """Memory of the MIP chain, bytes."""
         return self.pyramid.nbytes
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.nbytes}
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape

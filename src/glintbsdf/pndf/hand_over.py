@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..errors import check
 from ..kernels import TexelKernel
+from ..reach import Reach
 from .filtered import Filtered
 
 #: Roughness of the lobe besides that of the map: almost none, as a P-NDF has none of its own.
@@ -25,12 +26,15 @@ class HandOver:
         near: the P-NDF of a normal map.
         sigma (float): texels, > 0.
         owner (str): whom errors name, usually the plugin.
+        reach (Reach): what will be asked, see :class:`Filtered`.
     """
 
-    def __init__(self, near: object, sigma: float, owner: str = "HandOver") -> None:
+    def __init__(
+        self, near: object, sigma: float, owner: str = "HandOver", reach: Reach | None = None
+    ) -> None:
         check(sigma > 0, owner, "hand_over", "a number > 0", sigma)
         self.near, self.sigma = near, float(sigma)
-        self.far = Filtered(near.normal_map, "lean", alpha=ALPHA, owner=owner)
+        self.far = Filtered(near.normal_map, "lean", alpha=ALPHA, owner=owner, reach=reach)
 
     # What others ask a P-NDF of a normal map for.
     data = property(lambda self: self.near.data)
@@ -82,6 +86,11 @@ class HandOver:
     def nbytes(self) -> int:
         """Memory of both, bytes."""
         return self.near.nbytes + self.far.nbytes
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of both, bytes."""
+        return {**self.near.parts, **self.far.parts}
 
     def __repr__(self) -> str:
         near, far = (str(x).replace("\n", "\n  ") for x in (self.near, self.far))

@@ -19,7 +19,8 @@ from ..errors import check, check_choice
 from ..kernels import KERNELS, TexelKernel
 from ..lattice import Lattice, floor_int
 from ..normalmap import NormalMap
-from .quad_lists import QuadLists, every_quad
+from ..reach import Reach
+from .quad_lists import QuadLists, Window, every_quad
 
 #: Footprints that touch no more quads than this are summed quad by quad; larger ones use the lists.
 FEW_QUADS = 25
@@ -246,9 +247,14 @@ class TexelMesh:
         self.build()
 
     @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        return {"vertices": 4 * dr.width(self.vertices)}
+
+    @property
     def nbytes(self) -> int:
         """Memory of the structure, bytes."""
-        return 4 * dr.width(self.vertices)
+        return sum(self.parts.values())
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape
@@ -262,6 +268,11 @@ class Manifold(TexelMesh):
     """Exact P-NDF of a normal map (Eq. 5) and its exact sampler (Eq. 6).
 
     Arguments, attributes and errors are those of :class:`TexelMesh`.
+
+    Args:
+        reach (Reach): what will be asked; None for anything. Lists are then made of the part of the
+            map that it touches, or none where all footprints are summed quad by quad. Evaluation
+            within the reach is the same to the last bit.
     """
 
     def __init__(
@@ -270,26 +281,34 @@ class Manifold(TexelMesh):
         kernel: str = "gaussian",
         epsilon: float = 1e-6,
         owner: str = "Manifold",
+        reach: Reach | None = None,
     ) -> None:
-        key = f"manifold {QuadLists.VERSION} {normal_map.content_hash} {epsilon!r}"
-        self.cached = lambda build: load_or_build(key, build)
+        self.reach = reach
+        self.key = f"manifold {QuadLists.VERSION} {normal_map.content_hash} {epsilon!r}"
+        self.cached = load_or_build
         super().__init__(normal_map, kernel, epsilon, owner)
-        self.cached = lambda build: build()  # of data that change, nothing is kept
+        self.cached = lambda key, build: build()  # of data that change, nothing is kept
 
     def build(self) -> None:
         """Make everything that depends on ``self.data``; the cache may know the lists already."""
         super().build()
-        self.lists = QuadLists(
-            self.lattice,
-            self.cached(
-                lambda: QuadLists.build(
-                    self.lattice,
-                    self.effective_triangles,
-                    self.data.numpy().reshape(-1, 2),
-                    self.bounds(),
-                )
+        self.lists = None
+        if self.reach is not None and self.reach.most_quads <= FEW_QUADS:
+            return
+        window = Window.whole(self.lattice)
+        if self.reach is not None:
+            window = Window.touched(self.lattice, self.reach)
+        arrays = self.cached(
+            self.key if window == Window.whole(self.lattice) else f"{self.key} {window}",
+            lambda: QuadLists.build(
+                self.lattice,
+                self.effective_triangles,
+                self.data.numpy().reshape(-1, 2),
+                self.bounds(),
+                window,
             ),
         )
+        self.lists = QuadLists(self.lattice, arrays, window)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest rectangle (lower, upper) of projected normals that holds all triangles."""
@@ -303,7 +322,9 @@ class Manifold(TexelMesh):
         ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
         """
         kernel = self.texel_kernel(footprint)
-        active = mi.Bool(active) & (dr.squared_norm(m) < 1) & self.lists.covers(m)
+        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+        if self.lists is not None:
+            active &= self.lists.covers(m)
         few = kernel.touched_quads() <= FEW_QUADS
 
         def add(density, row, column, corner, active):
@@ -312,7 +333,9 @@ class Manifold(TexelMesh):
             return density + dr.select(active, added, 0)
 
         density = every_quad(self.lattice, kernel, add, active & few)
-        return density + self.lists.visit(m, kernel, add, active & ~few)
+        if self.lists is not None:
+            density += self.lists.visit(m, kernel, add, active & ~few)
+        return density
 
     def sample(
         self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
@@ -326,6 +349,7 @@ class Manifold(TexelMesh):
         return self.normal_at(kernel.mean + kernel.sample(sample2), active)
 
     @property
-    def nbytes(self) -> int:
-        """Memory of vertices and lists, bytes."""
-        return super().nbytes + self.lists.nbytes
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        lists = 0 if self.lists is None else self.lists.nbytes
+        return {**super().parts, "lists of quads": lists}
