@@ -12,7 +12,6 @@ from math import ceil, sqrt
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 #: Points per cell. Saturation, which takes many more throws, is at about 0.33.
 FILL = 0.29
@@ -72,6 +71,8 @@ def balanced_areas(places: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     the square evenly: their mass then differs from one by less than 1e-3 from two mean distances
     on, where equal areas leave 14 %. They sum to n².
     """
+    from scipy.ndimage import gaussian_filter, map_coordinates  # only flakes pay for it
+
     n = len(places)
     row, column = np.nonzero(~np.isnan(places[..., 0]))
     x, y = places[row, column].astype(np.float64).T
