@@ -12,11 +12,10 @@ measuring: 1.2 × for footprints of up to a pixel, more for stretched ones by th
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -24,18 +23,15 @@ import glintbsdf
 
 mi.set_variant("llvm_ad_rgb")
 
+from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # noqa: E402
 from curved_patch import MAP, UV_SCALE, curved_patch  # noqa: E402
 
 from glintbsdf.pndf.filtered import METHODS  # noqa: E402
 from glintbsdf.rendering import pixel_angle  # noqa: E402
 
 
-def seconds(scene: mi.Scene, spp: int, seed: int) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(mi.render(scene, spp=spp, seed=seed))
-    dr.sync_thread()
-    return time.perf_counter() - start
+def frame(scene: mi.Scene, spp: int, seed: int) -> mi.TensorXf:
+    return mi.render(scene, spp=spp, seed=seed)
 
 
 def main() -> None:
@@ -53,7 +49,7 @@ def main() -> None:
     rough = {"type": "roughconductor", "material": "Cr", "alpha_u": alpha_u, "alpha_v": alpha_v}
     rough = curved_patch(rough, options.size, options.spp)
     angle = pixel_angle(rough.sensors()[0])
-    seconds(rough, options.spp, 0)
+    seconds(frame, rough, options.spp, 0)
     results = []
     print("footprint   method      × roughconductor   milliseconds   building   first frame")
     for pixels in options.pixels:
@@ -74,14 +70,10 @@ def main() -> None:
                 options.spp,
             )
             building[method] = time.perf_counter() - start
-            first[method] = seconds(scenes[method], options.spp, 0)
-        times = np.array(
-            [
-                [seconds(scene, options.spp, seed) for scene in scenes.values()]
-                for seed in range(1, options.repetitions + 1)
-            ]
-        )
-        ratios = np.median(times[:, 1:] / times[:, :1], axis=0)
+            first[method] = seconds(frame, scenes[method], options.spp, 0)
+        frames = [partial(frame, scene, options.spp) for scene in scenes.values()]
+        times = seconds_in_turn(frames, options.repetitions)
+        ratios = ratios_to_first(times)[1:]
         for method, ratio, taken in zip(
             options.methods, ratios, np.median(times, axis=0)[1:], strict=True
         ):
@@ -101,21 +93,14 @@ def main() -> None:
                 }
             )
     if options.output:
-        options.output.write_text(
-            json.dumps(
-                {
-                    "mitsuba": mi.__version__,
-                    "drjit": dr.__version__,
-                    "llvm": list(dr.detail.llvm_version()),
-                    "threads": dr.thread_count(),
-                    "size": options.size,
-                    "spp": options.spp,
-                    "max_anisotropy": options.max_anisotropy,
-                    "results": results,
-                },
-                indent=1,
-            )
-            + "\n"
+        save_results(
+            options.output,
+            {
+                "size": options.size,
+                "spp": options.spp,
+                "max_anisotropy": options.max_anisotropy,
+                "results": results,
+            },
         )
 
 

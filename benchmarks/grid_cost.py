@@ -11,18 +11,18 @@ at most 1.5 along the normal and 3 at 10°, whatever the distance and density.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import time
+from functools import partial
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-import glintbsdf
+import glintbsdf  # noqa: F401  (registers the plugins)
 
 mi.set_variant("llvm_ad_rgb")
+
+from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # noqa: E402
 
 SIZE, SPP, FOV = 400, 16, 30.0
 GLINTS = {
@@ -66,12 +66,8 @@ def scene(bsdf: dict, elevation: float, distance: float) -> mi.Scene:
     })  # fmt: skip
 
 
-def seconds(scene: mi.Scene, seed: int) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(mi.render(scene, seed=seed))
-    dr.sync_thread()
-    return time.perf_counter() - start
+def frame(scene: mi.Scene, seed: int) -> mi.TensorXf:
+    return mi.render(scene, seed=seed)
 
 
 def main() -> None:
@@ -84,31 +80,28 @@ def main() -> None:
     for elevation in (90, 10):
         for distance in (1.0, 30.0):
             scenes = {k: scene(bsdf, elevation, distance) for k, bsdf in MATERIALS.items()}
-            first = {name: seconds(s, 0) for name, s in scenes.items()}
-            times = {name: [] for name in scenes}
-            for seed in range(1, options.repetitions + 1):
-                for name, s in scenes.items():
-                    times[name].append(seconds(s, seed))
-            for name in scenes:
+            first = {name: seconds(frame, s, 0) for name, s in scenes.items()}
+            times = seconds_in_turn(
+                [partial(frame, s) for s in scenes.values()], options.repetitions
+            )
+            for name, taken, ratio in zip(
+                scenes, np.median(times, axis=0), ratios_to_first(times), strict=True
+            ):
                 row = {
                     "elevation": elevation,
                     "distance": distance,
                     "material": name,
                     "first_frame": first[name],
-                    "frame": float(np.median(times[name])),
-                    "ratio": float(np.median(np.divide(times[name], times["roughconductor"]))),
+                    "frame": float(taken),
+                    "ratio": float(ratio),
                 }
                 results.append(row)
                 print(f"{elevation:8}° {distance:9} {name:15} {row['first_frame']:10.2f} s"
                       f" {row['frame']:11.3f} {row['ratio']:18.2f}")  # fmt: skip
     if options.output:
-        options.output.write_text(
-            json.dumps({
-                "version": glintbsdf.__version__, "mitsuba": mi.__version__,
-                "drjit": dr.__version__, "threads": dr.thread_count(),
-                "bytes": mi.load_dict(GLINTS).pndf.nbytes, "results": results,
-            }, indent=1) + "\n"
-        )  # fmt: skip
+        save_results(
+            options.output, {"bytes": mi.load_dict(GLINTS).pndf.nbytes, "results": results}
+        )
 
 
 if __name__ == "__main__":

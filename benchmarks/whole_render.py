@@ -12,35 +12,32 @@ measuring: 1.5 × at 1/16 pixel, 4 × at 1 pixel, 15 × at 4 pixels.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 os.environ["GLINTBSDF_CACHE"] = "off"  # building is timed
 _kernels = tempfile.TemporaryDirectory()
 os.environ["DRJIT_CACHE_DIR"] = _kernels.name  # and so is compiling
 
-import drjit as dr  # noqa: E402  (the environment comes first)
-import mitsuba as mi  # noqa: E402
+import mitsuba as mi  # noqa: E402  (the environment comes first)
 import numpy as np  # noqa: E402
 
 import glintbsdf  # noqa: E402, F401  (registers the plugins)
 
 mi.set_variant("llvm_ad_rgb")
 
+from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # noqa: E402
+
 from glintbsdf.rendering import load_scene, pixel_angle  # noqa: E402
 
 SCENE = Path(__file__).parent.parent / "scenes" / "curved_patch.xml"
 
 
-def seconds(scene: mi.Scene, spp: int, seed: int) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(mi.render(scene, spp=spp, seed=seed))
-    dr.sync_thread()
-    return time.perf_counter() - start
+def frame(scene: mi.Scene, spp: int, seed: int) -> mi.TensorXf:
+    return mi.render(scene, spp=spp, seed=seed)
 
 
 def smooth(size: int, spp: int) -> mi.Scene:
@@ -79,7 +76,7 @@ def main() -> None:
     if options.map:
         defines["map"] = options.map
     rough = smooth(options.size, options.spp)
-    first = {"roughconductor": seconds(rough, options.spp, 0)}
+    first = {"roughconductor": seconds(frame, rough, options.spp, 0)}
     print(f"roughconductor: first frame {first['roughconductor']:.2f} s")
 
     results = []
@@ -88,14 +85,10 @@ def main() -> None:
         start = time.perf_counter()
         scene = load_scene(SCENE, {**defines, "pixel_spread": str(pixels * angle)})
         loading = time.perf_counter() - start
-        first_frame = seconds(scene, options.spp, 0)
-        times = np.array(
-            [
-                [seconds(s, options.spp, seed) for s in (rough, scene)]
-                for seed in range(1, options.repetitions + 1)
-            ]
-        )
-        ratio = float(np.median(times[:, 1] / times[:, 0]))
+        first_frame = seconds(frame, scene, options.spp, 0)
+        frames = [partial(frame, s, options.spp) for s in (rough, scene)]
+        times = seconds_in_turn(frames, options.repetitions)
+        ratio = float(ratios_to_first(times)[1])
         medians = np.median(times, axis=0)
         print(
             f"footprint {pixels:7.4f} pixels: {ratio:5.2f} × roughconductor "
@@ -114,21 +107,7 @@ def main() -> None:
             }
         )
     if options.output:
-        options.output.write_text(
-            json.dumps(
-                {
-                    "mitsuba": mi.__version__,
-                    "drjit": dr.__version__,
-                    "llvm": list(dr.detail.llvm_version()),
-                    "threads": dr.thread_count(),
-                    "size": options.size,
-                    "spp": options.spp,
-                    "results": results,
-                },
-                indent=1,
-            )
-            + "\n"
-        )
+        save_results(options.output, {"size": options.size, "spp": options.spp, "results": results})
 
 
 if __name__ == "__main__":
