@@ -179,7 +179,7 @@ import error_vs_time as script
 
 if __name__ == "__main__":
     script.QUICK = script.Settings(
-        script.pndf.Settings(64, (2, 8), ((0.37, 0.61),), 16, 20_000, 5.0, 2, 0.002),
+        script.pndf.Settings(64, (2, 8), ((0.37, 0.61),), 16, 20_000, 2**17, 5.0, 2, 0.002),
         script.images.Settings(64, ("flakes",), (2.0,), 16, 32, (1, 4), 2),
         script.grid.Settings(2000, 1),
     )
@@ -240,7 +240,7 @@ def test_everything_asked_for_is_there(folder, report):
         assert [p["method"] for p in unit["points"]] == ["manifold, exact", "filter, lean"]
         exact, lean = unit["points"]
         assert exact["times_faster_than_exact"] == 1
-        assert exact["l1"] < 2 * exact["noise_l1"]
+        assert exact["l1"] < 3 * exact["noise_l1"]
     # One facet under the smaller footprint is a lobe, as LEAN has it; a few are none.
     assert report["pndf"][0]["points"][1]["l1"] < 0.1 < 0.3 < lean["l1"]
     (case,) = report["images"]

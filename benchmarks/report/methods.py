@@ -161,7 +161,7 @@ FILTERS = ("toksvig", "clean", "variance", "lean")
 
 METHODS = [
     EXACT,
-    *manifold("manifold, tables", "max_error", TABLES, quick=(0.2, 0.05, 0.01), image=(0.05,)),
+    *manifold("manifold, tables", "max_error", TABLES, quick=(0.2, 0.05), image=(0.05,)),
     *manifold("manifold, clusters", "threshold", (1e-2, 1e-3, 1e-4), label="τ", quick=(1e-3,)),
     *elements("elements", "step", (2.0, 1.0, 0.5), quick=(1.0, 0.5), image=(0.5,)),
     *elements("flat elements", "step", (1.0, 0.5), elements="flat"),

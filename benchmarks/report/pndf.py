@@ -13,7 +13,7 @@ import numpy as np
 
 from glintbsdf import NormalMap
 from glintbsdf.footprint import Footprint
-from glintbsdf.pndf import Manifold
+from glintbsdf.pndf.manifold import TexelMesh
 from glintbsdf.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
 
 from .methods import EXACT, SIGMA_R, Method, Surface
@@ -39,9 +39,9 @@ MOST_POINTS = 16
 class Settings:
     """How the P-NDF level is measured.
 
-    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``patience``
-    the seconds to spend on the bins of one P-NDF, if queries took as long as random ones in one
-    thread, which they do not; ``batch`` those of a timed batch.
+    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``points``
+    the most at which a density is averaged over bins, in ``patience`` seconds, if they took as long
+    as random queries in one thread, which they do not; ``batch`` the seconds of a timed batch.
     """
 
     size: int
@@ -49,6 +49,7 @@ class Settings:
     places: tuple[tuple[float, float], ...]
     res: int
     samples: int
+    points: int
     patience: float
     repetitions: int
     batch: float
@@ -69,7 +70,7 @@ def structure(method: Method, surface: Surface, with_compiling: bool):
     first query, is what takes longer the first time, with Dr.Jit's own cache emptied; None where
     it is not asked for, as it hardly depends on the map.
     """
-    m, footprint = queries(surface.normal_map, 16.0, FEW)
+    m, footprint = queries(surface, 16.0, FEW)
     compiling = None
     if with_compiling:
         forget_kernels()
@@ -115,14 +116,16 @@ def texel_footprint(normal_map: NormalMap, uv: np.ndarray, sigma: float) -> Foot
     return Footprint(centre, mi.Vector2f(u, 0), mi.Vector2f(0, v))
 
 
-def queries(normal_map: NormalMap, radius: float, count: int):
+def queries(surface: Surface, radius: float, count: int):
     """Random places on the map, each with a normal drawn from its own exact P-NDF.
 
     So a BSDF's samples ask; light sampling asks for other normals too, where D is often 0.
     """
     uv, u = np.random.default_rng(7).random((2, 2, count), dtype=np.float32)
-    footprint = texel_footprint(normal_map, uv, radius / 3)
-    m = Manifold(normal_map).sample(footprint, 0.0, mi.Point2f(u))
+    footprint = texel_footprint(surface.normal_map, uv, radius / 3)
+    mesh = TexelMesh(surface.normal_map, epsilon=surface.epsilon)
+    kernel = mesh.texel_kernel(footprint)
+    m = mesh.normal_at(kernel.mean + kernel.sample(mi.Point2f(u)))
     dr.eval(m, footprint.uv)
     return m, footprint
 
@@ -143,7 +146,7 @@ def first(count: int, m, footprint):
 
 def measure(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
     """A unit of the store: errors and times of all methods under footprints of one size."""
-    per_query, ratios = times(structures, surface.normal_map, radius, settings)
+    per_query, ratios = times(structures, surface, radius, settings)
     # One grid of bins for all, as wide as the roughest needs.
     rough = any(roughness(pndf) > 0 for pndf in structures.values())
     bounds = normal_bounds(surface.normal_map, surface.epsilon, SIGMA_R if rough else 0.0)
@@ -171,7 +174,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                     f"reference {sigma_r:g}", references[sigma_r].density.astype(np.float32)
                 )
             footprint = texel_footprint(surface.normal_map, np.array(place)[:, None], radius / 3)
-            affordable = min(settings.patience / per_query[method], 2 * MOST)
+            affordable = min(settings.patience / per_query[method], settings.points)
             density, deviation = in_bins(pndf, footprint, references[sigma_r], affordable)
             pictures.setdefault(method.name, density.astype(np.float32))
             own_noise = noise(references[sigma_r], deviation)
@@ -269,13 +272,13 @@ def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def times(structures: dict[Method, object], normal_map, radius, settings):
+def times(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
     """Median seconds per query of every method, and how many times faster than exact it is.
 
     One thread. All methods in turn within every repetition, after a warm-up that compiles and says
     how many queries make a batch.
     """
-    many = queries(normal_map, radius, MOST)
+    many = queries(surface, radius, MOST)
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
