@@ -570,6 +570,9 @@ NORMAL_MAPS = {
     "brushed.exr": lambda: maps.brushed(
         MAP_SIZE, alpha=0.25, streak_length=60, streak_width=4, seed=3
     ),
+    # Small samples, of which glint_mip makes large maps
+    "leather_sample.exr": lambda: maps.leather(256, seed=4),
+    "isotropic_sample.exr": lambda: maps.isotropic(256, seed=6),
 }
 
 

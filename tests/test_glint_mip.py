@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import cos, sin, sqrt
+from pathlib import Path
 
 import bsdf_suite as suite
 import drjit as dr
@@ -197,3 +198,11 @@ def test_new_data_make_a_new_map(variant):
     assert dr.allclose(
         after, suite.density(fresh, VIEWS["grids and cells"], mi.Vector2f(0.1, 0.05))
     )
+
+
+def test_the_scene_renders_its_glints(variant):
+    scenes = Path(__file__).parents[1] / "scenes"
+    small = {"resx": "24", "resy": "24", "spp": "4", "output_size": "300"}
+    scene = mi.load_file(str(scenes / "samples.xml"), **small, pixel_spread="0.005")
+    image = np.array(mi.render(scene, seed=1))
+    assert np.isfinite(image).all() and image.mean() > 0.01
