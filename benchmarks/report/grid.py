@@ -10,15 +10,17 @@ smooth surface.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from _common import seconds_in_turn
 
 from glintbsdf.footprint import Footprint
 from glintbsdf.pndf.grid import Grid, beckmann, slope_jacobian
 
-from .pndf import seconds
+from .pndf import batch
 
 #: Of the footprint: its axes are as 1 to this.
 STRETCH = 64.0
@@ -64,10 +66,8 @@ def measure(settings: Settings):
         ratio: (pndf.eval(m, footprint) / smooth).numpy().astype(np.float64)
         for ratio, pndf in rungs.items()
     }
-    taken = {ratio: [] for ratio in rungs}
-    for _ in range(settings.repetitions + 1):
-        for ratio, pndf in rungs.items():
-            taken[ratio].append(seconds(pndf, m, footprint))
+    works = [partial(batch, pndf, m, footprint) for pndf in rungs.values()]
+    taken = np.median(seconds_in_turn(works, settings.repetitions), axis=0) / settings.places
     full = contrast(values[LADDER[-1]])
     points = [
         {
@@ -77,9 +77,9 @@ def measure(settings: Settings):
             "contrast": contrast(value),
             "contrast_error": contrast_error(value),
             "loss_of_contrast": 1 - contrast(value) / full,
-            "seconds_per_query": float(np.median(taken[ratio][1:])) / settings.places,
+            "seconds_per_query": float(per_query),
         }
-        for ratio, value in values.items()
+        for (ratio, value), per_query in zip(values.items(), taken, strict=True)
     ]
     return {"stretch": STRETCH, "points": points}, {}
 

@@ -6,10 +6,12 @@ import os
 import shutil
 import time
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from _common import seconds, seconds_in_turn
 
 from glintbsdf import NormalMap
 from glintbsdf.footprint import Footprint
@@ -75,11 +77,11 @@ def structure(method: Method, surface: Surface, with_compiling: bool):
     if with_compiling:
         forget_kernels()
         pndf, cold = timed(lambda: build(method, surface))
-        cold += seconds(pndf, m, footprint)
+        cold += seconds(pndf.eval, m, footprint)
     pndf, building = timed(lambda: build(method, surface))
     if with_compiling:
-        seconds(pndf, m, footprint)
-        compiling = max(cold - building - seconds(pndf, m, footprint), 0.0)
+        seconds(pndf.eval, m, footprint)
+        compiling = max(cold - building - seconds(pndf.eval, m, footprint), 0.0)
     return pndf, {
         "build_seconds": building,
         "compile_seconds": compiling,
@@ -102,11 +104,6 @@ def forget_kernels() -> None:
     folder = os.environ["DRJIT_CACHE_DIR"]
     shutil.rmtree(folder, ignore_errors=True)
     os.makedirs(folder)
-
-
-def seconds(pndf, m, footprint) -> float:
-    """Wall-clock time of evaluating one batch."""
-    return timed(lambda: dr.eval(pndf.eval(m, footprint)))[1]
 
 
 def texel_footprint(normal_map: NormalMap, uv: np.ndarray, sigma: float) -> Footprint:
@@ -282,23 +279,26 @@ def times(structures: dict[Method, object], surface: Surface, radius: float, set
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
-        batches = {}
-        for method, pndf in structures.items():
+        works, counts = [], []
+        for pndf in structures.values():
             few = first(FEW, *many)
-            taken = min(seconds(pndf, *few) for _ in range(2))
-            count = int(np.clip(FEW * settings.batch / taken, FEW, MOST)) // 8 * 8
-            batches[method] = (pndf, *first(count, *many))
-        taken = {method: [] for method in batches}
-        for _ in range(settings.repetitions):
-            for method, (pndf, m, footprint) in batches.items():
-                taken[method].append(seconds(pndf, m, footprint) / dr.width(m))
+            taken = min(seconds(pndf.eval, *few) for _ in range(2))
+            counts.append(int(np.clip(FEW * settings.batch / taken, FEW, MOST)) // 8 * 8)
+            works.append(partial(batch, pndf, *first(counts[-1], *many)))
+        taken = seconds_in_turn(works, settings.repetitions) / counts
     finally:
         dr.set_thread_count(threads)
-    exact = next((taken[method] for method in taken if method.name == EXACT.name), None)
-    return (
-        {method: float(np.median(values)) for method, values in taken.items()},
-        {
-            method: None if exact is None else float(np.median(np.divide(exact, values)))
-            for method, values in taken.items()
-        },
+    per_query = np.median(taken, axis=0)
+    names = [method.name for method in structures]
+    ratios = [None] * len(names)
+    if EXACT.name in names:
+        exact = taken[:, [names.index(EXACT.name)]]
+        ratios = np.median(exact / taken, axis=0).tolist()
+    return dict(zip(structures, per_query.tolist(), strict=True)), dict(
+        zip(structures, ratios, strict=True)
     )
+
+
+def batch(pndf, m, footprint, repetition: int) -> mi.Float:
+    """The same queries in every repetition."""
+    return pndf.eval(m, footprint)

@@ -26,6 +26,14 @@ from glintbsdf.rendering import replacing
 _ROOT = Path(__file__).parents[2]
 _TEXT = "__json__"
 
+#: Source on which the figures depend: folders, and modules of the benchmarks.
+_MEASURED = ("src/glintbsdf", "plugins")
+_MEASURING = (
+    "_common",
+    "curved_patch",
+    *(f"report/{m}" for m in ("methods", "pndf", "images", "grid")),
+)
+
 
 class Store:
     """Units in a folder, for one ``context``: whatever all of them depend on."""
@@ -75,12 +83,12 @@ def machine() -> dict:
 
 
 def source_hash() -> str:
-    """A hash of the package's own source, and of this benchmark's measuring parts."""
+    """A hash of the package's own source, and of what of the benchmarks measures."""
+    paths = [path for folder in _MEASURED for path in sorted((_ROOT / folder).rglob("*.py"))]
+    paths += [_ROOT / "benchmarks" / f"{name}.py" for name in _MEASURING]
     digest = hashlib.blake2b(digest_size=8)
-    folders = ["src/glintbsdf", "plugins", "benchmarks/report"]
-    for path in sorted(path for folder in folders for path in (_ROOT / folder).rglob("*.py")):
-        if path.parent.name != "report" or path.stem in ("methods", "pndf", "images", "grid"):
-            digest.update(path.read_bytes())
+    for path in paths:
+        digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
