@@ -16,6 +16,11 @@ from test_scenes import SCENES, load, repeatability
 # which repeat between two renders just as glints do.
 CASES = {
     "kettle_elements": (30, (0.50, 0.75, 0.25, 0.55), {"uv_scale": 0.5}),
+    "car_paint": (
+        30,
+        (0.20, 0.40, 0.20, 0.80),
+        {"uv_scale": 0.2, "flake_density": 600, "flake_sigma_r": 0.03},
+    ),
     "leather_sofa": (
         32,
         (0.20, 0.36, 0.28, 0.48),
@@ -48,7 +53,7 @@ def test_glints_where_a_smooth_material_has_none(variant, name, tmp_path):
     file.write_text(text, encoding="utf-8")
     coarse = {key: value for key, value in coarse.items() if f"${key}" in text}
     smooth = repeatability(load(file, **IMAGE, **coarse), window)
-    # Measured: 0.68 and 0.02 (kettle), 0.64 and 0.16 (sofa)
+    # Measured: 0.68 and 0.02 (kettle), 0.81 and 0.03 (car), 0.64 and 0.16 (sofa)
     assert glints > 0.4, glints
     assert smooth < 0.25, smooth
 
@@ -65,7 +70,7 @@ def test_strategies_of_the_textured_light(variant):
         )
         return np.array([np.array(mi.render(scene, seed=seed)).mean(axis=2) for seed in seeds])
 
-    reference = images(1, 1, 256, range(9, 10))
+    reference = images(1, 1, 128, range(9, 10))
     assert np.isfinite(reference).all() and reference.mean() > 0.1
     errors = {}
     for strategy in ((1, 0), (0, 1), (1, 1)):
