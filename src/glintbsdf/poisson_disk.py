@@ -68,8 +68,8 @@ def balanced_areas(places: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Areas (cells) for the points of :func:`poisson_disk`, n×n, 0 in cells without a point.
 
     Seen through a Gaussian wider than ``BALANCE`` mean distances, points with these areas cover
-    the square evenly: their mass then differs from one by less than 1e-3 from two mean distances
-    on, where equal areas leave 14 %. They sum to n².
+    the square evenly: through one of 2.6 mean distances, their mass differs from one by less than
+    1e-3, where equal areas leave a tenth. They sum to n².
     """
     from scipy.ndimage import gaussian_filter, map_coordinates  # only flakes pay for it
 

@@ -29,7 +29,7 @@ from ..normalmap import NormalMap
 from .quad_lists import QuadLists, every_quad
 
 #: Of the lists; part of their name in the cache.
-VERSION = 3
+VERSION = 4
 
 #: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
 FEW_CELLS = 25
@@ -533,12 +533,16 @@ class Elements(Mixture):
         )
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
-        """The rectangle (lower, upper) that holds the bounds of all cells."""
+        """The rectangle (lower, upper) that holds the bounds of all cells, and a margin.
+
+        In the margin the cells at its border are found: of a flat map, all that is beyond reach.
+        """
         columns = self.lattice.x.quads
         index = dr.arange(mi.UInt32, columns * self.lattice.y.quads)
         corner, first, second = self.bounds(index // columns, index % columns)
-        lower = corner + dr.minimum(first, 0) + dr.minimum(second, 0)
-        upper = corner + dr.maximum(first, 0) + dr.maximum(second, 0)
+        margin = 1.5 * self.sigma_r
+        lower = corner + dr.minimum(first, 0) + dr.minimum(second, 0) - margin
+        upper = corner + dr.maximum(first, 0) + dr.maximum(second, 0) + margin
         return tuple(
             np.array([extreme(v)[0] for v in bound], np.float32)
             for extreme, bound in ((dr.min, lower), (dr.max, upper))

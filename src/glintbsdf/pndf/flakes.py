@@ -23,7 +23,7 @@ VERSION = 1
 
 #: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
 #: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
-EVEN = 2.0
+EVEN = 2.6
 
 #: Memory that building takes, bytes per flake (measured), and that the lists are allowed.
 BYTES_TO_BUILD, BYTES_OF_LISTS = 600, 42
@@ -103,7 +103,7 @@ class Flakes(Mixture):
         self.areas = mi.Float(flakes["areas"].ravel())
         self.densest = float(flakes["densest"])
         self.element_bytes = 4 * (dr.width(self.flakes) + dr.width(self.areas))
-        self.normals = flakes["flakes"].reshape(-1, 4)[flakes["areas"].ravel() > 0, 2:]
+        self.flake_normals = flakes["flakes"].reshape(-1, 4)[flakes["areas"].ravel() > 0, 2:]
         self.build(lambda build: load_or_build(f"{key} {sigma_r!r}", build))
 
     def scatter(self) -> dict[str, np.ndarray]:
@@ -130,10 +130,11 @@ class Flakes(Mixture):
             return dr.gather(mi.Float, self.areas, self.index(row, column), active) > 0
 
         blocks = BlocksOfFlakes(self.lattice, triangles, occupied, self.count)
-        bounds = self.normals.min(0) - 1.001 * reach, self.normals.max(0) + 1.001 * reach
+        outer = reach + 1.5 * self.sigma_r[0]  # in the margin, the cells at its border are found
+        bounds = self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
 
         def lists(allowed):
-            return Builder(blocks, self.normals, bounds, allowed).arrays()
+            return Builder(blocks, self.flake_normals, bounds, allowed).arrays()
 
         self.lists = QuadLists(self.lattice, cached(lambda: lists(BYTES_OF_LISTS)))
         # With a single cell of normals: all flakes, block by block.
