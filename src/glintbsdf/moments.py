@@ -496,10 +496,10 @@ class MomentPyramid:
             first = corner - count * dr.floor((corner + 0.5) * grid.inverse_count)
             second = dr.select(first + 1 < count, first + 1, 0)
         elif self.periodic:
-            first, second = corner, corner + 1
+            first, second = (mi.Vector2i(corner + k) for k in (0, 1))  # may be below 0
         else:
             first, second = (dr.clip(corner + k, 0, count - 1) for k in (0, 1))
-        (x0, y0), (x1, y1) = (mi.Vector2u(mi.Vector2i(v)) for v in (first, second))
+        (x0, y0), (x1, y1) = mi.Vector2u(first), mi.Vector2u(second)
         rows = [grid.offset + y * grid.pitch for y in (y0, y1)]
         index = [row + x for row in rows for x in (x0, x1)]
         weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
