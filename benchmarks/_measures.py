@@ -1,0 +1,551 @@
+"""What ``stability.py`` measures of a BSDF: plain functions that return numbers, and do not judge.
+
+The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as for the checks of
+``tests/bsdf_suite.py``, whose views, densities and χ² test are used here.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from math import radians
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.footprint import Footprint
+from glintbsdf.pndf import Grid
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+import bsdf_suite as suite  # noqa: E402
+from bsdf_suite import View  # noqa: E402
+
+Array = np.ndarray
+
+# --------------------------------------------------------------------------------------------------
+#  Extremes: many lanes, each a combination of what breaks what is written carelessly
+# --------------------------------------------------------------------------------------------------
+
+#: Larger standard deviation of a footprint (maps), ratio of both, and inclination of a direction.
+SIZES = (0, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 100)
+RATIOS = (1, 10, 1e2, 1e4)
+INCLINATIONS = (0, 30, 60, 85, 89.9, 89.9999, 90)
+#: Size of the UV coordinates.
+PLACES = (0, 1, 1e3, 1e6)
+#: Radiance of a light: what is reflected of it must be a number as well.
+RADIANCE = 1e6
+
+
+def direction(inclination: Array, azimuth: Array) -> Array:
+    """Unit vectors (3, N) from angles in radians; 90° is horizontal to the last digit."""
+    horizontal = inclination >= radians(90)
+    z = np.where(horizontal, 0, np.cos(inclination))
+    return np.stack(
+        [np.sin(inclination) * np.cos(azimuth), np.sin(inclination) * np.sin(azimuth), z]
+    )
+
+
+def extreme_interaction(count: int, seed: int) -> mi.SurfaceInteraction3f:
+    """Interactions that combine the extremes at random; a quarter of them has no UV partials.
+
+    The parameterisation is orthonormal, mirrored (inverted UVs), with parallel partial derivatives,
+    almost parallel ones, or none.
+    """
+    rng = np.random.default_rng(seed)
+    # In order, so that lanes that run together take about as long.
+    size = np.repeat(SIZES, -(-count // len(SIZES)))[:count]
+    ratio, place = rng.choice(RATIOS, count), rng.choice(PLACES, count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    given = rng.random(count) < 0.75
+    axes = np.stack([np.cos(angle), np.sin(angle)]), np.stack([-np.sin(angle), np.cos(angle)])
+    dx, dy = size * given * axes[0], size / ratio * given * axes[1]
+    dp_du = np.array([[1, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0, 0]])
+    dp_dv = np.array([[0, 1, 0], [0, -1, 0], [2, 0, 0], [1, 1e-7, 0], [0, 0, 0]])
+    frame = rng.integers(0, len(dp_du), count)
+    wi = direction(np.radians(rng.choice(INCLINATIONS, count)), rng.uniform(0, 2 * np.pi, count))
+
+    si = View().interaction(count)
+    si.uv = vector(mi.Point2f, place * rng.uniform(-1, 1, (2, count)))
+    si.duv_dx, si.duv_dy = vector(mi.Vector2f, dx), vector(mi.Vector2f, dy)
+    si.dp_du, si.dp_dv = (vector(mi.Vector3f, d[frame].T) for d in (dp_du, dp_dv))
+    si.wi = vector(mi.Vector3f, wi)
+    si.t = mi.Float(np.float32(10 ** rng.uniform(-3, 6, count)))
+    return si
+
+
+def vector(kind: type, values: Array):
+    """An array of vectors in float32 from NumPy (D, N)."""
+    return kind(*(mi.Float(np.float32(row)) for row in values))
+
+
+def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
+    """How many lanes show what is not finite (``nan``), and how many what is ``negative``.
+
+    Looked at: direction, density and weight of samples, values and densities there and in other
+    directions down to the horizon, albedo; all values as reflected of a light of ``RADIANCE``.
+    """
+    si = extreme_interaction(count, seed)
+    u = suite.random_numbers(count, 3, seed)
+    ctx = mi.BSDFContext()
+    bs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))
+    rng = np.random.default_rng(seed + 1)
+    elsewhere = direction(
+        np.radians(rng.choice(INCLINATIONS, count)), rng.uniform(0, 2 * np.pi, count)
+    )
+    dr.eval(bs, weight)
+    lost, negative = ~dr.all(dr.isfinite(bs.wo)), mi.Bool(False)
+
+    def look(*numbers) -> None:
+        nonlocal lost, negative
+        for number in numbers:
+            lost = lost | ~dr.all(dr.isfinite(mi.Color3f(number)))
+            negative = negative | dr.any(mi.Color3f(number) < 0)
+        dr.eval(lost, negative)
+
+    look(
+        RADIANCE * suite.intensity(weight),
+        bs.pdf,
+        suite.intensity(bsdf.eval_diffuse_reflectance(si)),
+    )
+    # One after the other, so that one kernel serves both.
+    for wo in (bs.wo, vector(mi.Vector3f, elsewhere)):
+        dr.make_opaque(wo)
+        value, pdf = bsdf.eval_pdf(ctx, si, wo)
+        look(RADIANCE * suite.intensity(value), pdf)
+    return {"nan": int(dr.count(lost)[0]), "negative": int(dr.count(negative)[0])}
+
+
+# --------------------------------------------------------------------------------------------------
+#  Densities: what is drawn against what is stated, however narrow the spikes
+# --------------------------------------------------------------------------------------------------
+
+#: Cells are not cut below this width: a normal recovered from ``wo`` has errors of about 1e-7.
+NARROWEST = 2e-5
+#: A cell with so few training points is not cut.
+LEAF = 32
+#: The quadrature refines until its standard error is this, if it can within these limits.
+TARGET, ROUNDS, MOST_BOXES = 3e-4, 16, 16_000
+#: Points along each side of a box.
+STRATA = 4
+
+
+def partition(points: Array) -> tuple[Array, Array]:
+    """Cut the square [−1, 1]² into cells that hold few of ``points`` (N, 2) each.
+
+    Empty margins and gaps are cut off first, so that the cells close around clusters of points of
+    any size; then cells are halved by number. Returns the cells (K, 2, 2: lower and upper corner),
+    and the cell of each point.
+    """
+    cells, cell_of = [], np.empty(len(points), np.int64)
+    open_cells = [(np.array([[-1.0, -1.0], [1.0, 1.0]]), np.arange(len(points)))]
+    while open_cells:
+        box, inside = open_cells.pop()
+        cut = cut_of(box, points[inside]) if len(inside) > LEAF else None
+        if cut is None:
+            cell_of[inside] = len(cells)
+            cells.append(box)
+            continue
+        axis, place = cut
+        left, right = box.copy(), box.copy()
+        left[1, axis] = right[0, axis] = place
+        below = points[inside, axis] < place
+        open_cells += [(left, inside[below]), (right, inside[~below])]
+    return np.array(cells), cell_of
+
+
+def cut_of(box: Array, points: Array) -> tuple[int, float] | None:
+    """Where to cut a cell: axis and place; None where that makes no sense any more."""
+    low, high = points.min(0), points.max(0)
+    margin = 0.1 * (high - low) + NARROWEST
+    empty = np.stack([low - margin - box[0], box[1] - high - margin]) / (box[1] - box[0])
+    side, axis = np.unravel_index(np.argmax(empty), empty.shape)
+    if empty[side, axis] > 0.25:
+        return int(axis), (low - margin, high + margin)[side][axis]
+    axis = int(np.argmax(high - low))
+    if high[axis] - low[axis] < NARROWEST:
+        return None
+    ordered = np.sort(points[:, axis])
+    gaps = np.diff(ordered)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < 0.25 * (high[axis] - low[axis]):
+        widest = len(ordered) // 2
+    return axis, 0.5 * (ordered[widest] + ordered[widest + 1])
+
+
+def count_in(cells: Array, points: Array) -> Array:
+    """How many of ``points`` (N, 2) lie in each cell."""
+    return np.array([((points >= low) & (points < high)).all(1).sum() for low, high in cells])
+
+
+def mass_of(density: Callable, cells: Array, points: Array, cell_of: Array) -> tuple[Array, Array]:
+    """Integral of ``density`` over each cell, and its standard error, by adaptive quadrature.
+
+    Boxes, at first the cells, are cut in four where jittered points disagree with each other, or
+    with the number of ``points``, samples of the density, in them. The integral is then taken by
+    fresh points.
+    """
+    rng = np.random.default_rng(5)
+
+    def estimate(boxes: Array, strata: int) -> tuple[Array, Array]:
+        n = strata * strata
+        stratum = np.stack(np.divmod(np.arange(n), strata), -1)
+        size = boxes[:, 1] - boxes[:, 0]
+        place = (stratum + rng.random((len(boxes), n, 2))) / strata
+        values = density((boxes[:, None, 0] + place * size[:, None]).reshape(-1, 2))
+        values = values.reshape(len(boxes), n) * size.prod(1, keepdims=True)
+        return values.mean(1), values.std(1, ddof=1) / np.sqrt(n)
+
+    boxes, owner, box_of = cells, np.arange(len(cells)), cell_of
+    mass, error = estimate(boxes, STRATA)
+    for _ in range(ROUNDS):
+        share = np.bincount(box_of, minlength=len(boxes)) / len(points)
+        # Points where the quadrature has found next to nothing: it has missed a spike.
+        missed = share > mass + 3 * np.sqrt((mass + 0.1 / len(points)) / len(points)) + 2 * error
+        doubt = np.maximum(error, np.where(missed, share - mass, 0))
+        if np.sqrt((doubt**2).sum()) < TARGET or len(boxes) > MOST_BOXES:
+            break
+        # Those that make up most of the doubt, as cells of equal doubt are what is aimed at.
+        cut = doubt > min(0.5 * doubt.max(), TARGET / np.sqrt(len(boxes)))
+        kept = np.cumsum(~cut) - 1
+        middle = boxes.mean(1)
+        quarter = (points >= middle[box_of]) @ np.array([2, 1])
+        after = kept[-1] + 1 + 4 * (np.cumsum(cut) - 1)
+        box_of = np.where(cut[box_of], after[box_of] + quarter, kept[box_of])
+        parts = quarters(boxes[cut])
+        boxes = np.concatenate([boxes[~cut], parts])
+        owner = np.concatenate([owner[~cut], np.repeat(owner[cut], 4)])
+        mass, error = (
+            np.concatenate([old[~cut], new])
+            for old, new in zip((mass, error), estimate(parts, STRATA), strict=True)
+        )
+    mass, error = estimate(boxes, STRATA + 2)
+    totals = np.bincount(owner, mass, len(cells))
+    return totals, np.sqrt(np.bincount(owner, error**2, len(cells)))
+
+
+def quarters(boxes: Array) -> Array:
+    """Each box cut in four, (4K, 2, 2): lower left, upper left, lower right, upper right."""
+    corners = np.stack([boxes[:, 0], boxes.mean(1), boxes[:, 1]])  # (3, K, 2)
+    parts = [
+        np.stack([np.stack([corners[i + k, :, 0], corners[j + k, :, 1]], -1) for k in (0, 1)], 1)
+        for i in (0, 1)
+        for j in (0, 1)
+    ]
+    return np.stack(parts, 1).reshape(-1, 2, 2)
+
+
+def density(bsdf: mi.BSDF, view: View, samples: int) -> dict[str, float]:
+    """The density of half vectors on the disk: is it normalised, and is it what is drawn?
+
+    ``mass``: ∫ pdf + share of invalid samples − 1, with the standard error ``mass_error``; a sample
+    is invalid where the normal reflects the view below the horizon, where the pdf is 0 as well.
+    ``p_value``: of Pearson's χ² test of half of the samples against the pdf, in cells that the
+    other half has shaped.
+    """
+    si, bs, _ = suite.sample(bsdf, view, 2 * samples, seed=3)
+    m = np.array(dr.normalize(si.wi + bs.wo), np.float64)[:2].T
+    valid = np.array(bs.pdf) > 0
+    training, test = (m[k::2][valid[k::2]] for k in (0, 1))
+
+    def at(s: Array) -> Array:
+        s = mi.Vector2f(*(mi.Float(np.float32(x)) for x in s.T))
+        inside = dr.squared_norm(s) < 1
+        value = suite.density(bsdf, view, dr.select(inside, s, 0))
+        return np.array(dr.select(inside, value, 0), np.float64)
+
+    cells, cell_of = partition(training)
+    mass, error = mass_of(at, cells, training, cell_of)
+    lost = 1 - valid.mean()
+    return {
+        "mass": float(mass.sum() + lost - 1),
+        "mass_error": float(np.sqrt((error**2).sum() + lost * (1 - lost) / (2 * samples))),
+        "p_value": suite.p_value(count_in(cells, test), samples, mass, error),
+    }
+
+
+def mean_of_grid(bsdf: mi.BSDF, count: int) -> list[dict[str, float]]:
+    """``mass``: the mean, less one, of the density of ``glint_grid`` over its expectation.
+
+    Over random places and normals, for footprints of some hundred microdetails, which lie apart.
+    """
+    pndf = bsdf.pndf
+    smooth = mi.MicrofacetDistribution(
+        mi.MicrofacetType.Beckmann, pndf.alpha.x, pndf.alpha.y, sample_visible=False
+    )
+    u = suite.random_numbers(count, 4, seed=8)
+    m, _ = smooth.sample(mi.Vector3f(0, 0, 1), mi.Point2f(u[0], u[1]))
+    sigma = 10 * dr.rcp(pndf.scale)
+    footprint = Footprint.isotropic(mi.Point2f(u[2], u[3]) * (1000 * sigma), sigma)
+    ratio = pndf.eval(mi.Vector2f(m.x, m.y), footprint) / smooth.eval(m)
+    ratio = np.atleast_2d(np.array(ratio, np.float64)).mean(0)
+    error = ratio.std() / np.sqrt(count)
+    return [{"view": "mean", "mass": float(ratio.mean() - 1), "mass_error": float(error)}]
+
+
+# --------------------------------------------------------------------------------------------------
+#  Energy
+# --------------------------------------------------------------------------------------------------
+
+
+def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> list[dict[str, float]]:
+    """Of each view what share of uniform light is reflected, ``energy`` and its standard ``error``.
+
+    ``spread``: footprints lie at places up to this far from the view's; 0 is one place.
+    """
+    count = len(views) * samples
+    si = View().interaction(count)
+    rng = np.random.default_rng(11)
+
+    def lanes(kind: type, values: Array):
+        return vector(kind, np.repeat(np.array(values, np.float64), samples, axis=0).T)
+
+    places = np.repeat(np.array([v.uv for v in views]), samples, axis=0).T
+    si.uv = vector(mi.Point2f, places + spread * rng.random((2, count)))
+    si.duv_dx = lanes(mi.Vector2f, [v.du for v in views])
+    si.duv_dy = lanes(mi.Vector2f, [v.dv for v in views])
+    si.wi = dr.normalize(lanes(mi.Vector3f, [v.wi for v in views]))
+    u = suite.random_numbers(count, 3, seed=4)
+    _, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    weight = np.atleast_2d(np.array(suite.intensity(weight), np.float64))
+    weight = weight.reshape(-1, len(views), samples)
+    mean, error = weight.mean(2), weight.std(2, ddof=1) / np.sqrt(samples)
+    channel = mean.argmax(0)
+    return [
+        {"energy": float(mean[c, k]), "error": float(error[c, k])} for k, c in enumerate(channel)
+    ]
+
+
+# --------------------------------------------------------------------------------------------------
+#  float32 against float64
+# --------------------------------------------------------------------------------------------------
+
+#: Modules that read parameters or belong to Mitsuba's own float32 structures.
+SINGLE = ("parameters", "normalmap", "bsdf", "registration", "rendering", "cli")
+
+
+class DoubleMitsuba:
+    """Mitsuba's names with float64 arrays in place of float32 ones.
+
+    This Mitsuba has no variant in double precision, but its types of arrays exist, and all of the
+    package's mathematics looks them up when it is called.
+    """
+
+    def __getattr__(self, name: str) -> object:
+        if name in ("Float", "TensorXf"):
+            return {"Float": mi.Float64, "TensorXf": mi.TensorXd}[name]
+        if name[-1] == "f" and name[-2].isdigit() and not name.startswith("Scalar"):
+            return getattr(mi, name[:-1] + "d")
+        return getattr(mi, name)
+
+
+class DoubleDrJit:
+    """Dr.Jit's functions; the bits of a float are those of a float32 all the same."""
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(dr, name)
+
+    def reinterpret_array(self, kind: type, value: object) -> object:
+        if kind is mi.Float64:
+            return mi.Float64(dr.reinterpret_array(mi.Float32, value))
+        return dr.reinterpret_array(kind, mi.Float32(value) if type(value) is mi.Float64 else value)
+
+
+@contextmanager
+def double_precision() -> Iterator[DoubleMitsuba]:
+    """Let the package compute in float64; what is loaded in the block must be used in it alone."""
+    double = {"mi": DoubleMitsuba(), "dr": DoubleDrJit()}
+    single = {"mi": mi, "dr": dr}
+    modules = [
+        module
+        for name, module in sys.modules.items()
+        if name.startswith("glintbsdf.")
+        and name.rpartition(".")[2] not in SINGLE
+        and getattr(module, "mi", None) is mi
+    ]
+    try:
+        for module in modules:
+            vars(module).update({k: v for k, v in double.items() if hasattr(module, k)})
+        yield double["mi"]
+    finally:
+        for module in modules:
+            vars(module).update({k: v for k, v in single.items() if hasattr(module, k)})
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Directions, normals and footprints in float32 (NumPy, one row per component).
+
+    ``floor``: what values are compared with at least.
+    """
+
+    uv: Array
+    du: Array
+    dv: Array
+    wi: Array
+    wo: Array
+    m: Array
+    floor: Array
+
+    def value(self, bsdf: object, m: object) -> Array:
+        """D(m) G of a glossy BSDF, or the value of a diffuse one; ``m``: Mitsuba's names."""
+        footprint = Footprint(m.Point2f(self.uv), m.Vector2f(self.du), m.Vector2f(self.dv))
+        wi, wo = m.Vector3f(self.wi), m.Vector3f(self.wo)
+        if hasattr(bsdf, "method"):
+            value = bsdf.method.eval(wi, wo, mi.TransportMode.Radiance, footprint, True)
+        else:
+            value = bsdf.pndf.eval(m.Vector2f(self.m), footprint, True)
+            if bsdf.masking is not None:
+                value = value * bsdf.masking.eval(wi, wo, footprint, True)
+        # One channel tells all: glints with colours share their density.
+        return np.atleast_2d(np.array(value))[0]
+
+
+def queries(bsdf: mi.BSDF, count: int) -> Queries:
+    """Queries at random footprints, of normals that the BSDF draws there."""
+    rng = np.random.default_rng(21)
+    size, ratio = 10 ** rng.uniform(-4, -0.5, count), 10 ** rng.uniform(0, 4, count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    c, s = np.cos(angle), np.sin(angle)
+    si = View().interaction(count)
+    uv = np.float32(rng.random((2, count)))
+    du, dv = np.float32(size * [c, s]), np.float32(size / ratio * [-s, c])
+    wi = direction(np.radians(rng.choice((0, 30, 60, 85), count)), rng.uniform(0, 7, count))
+    si.uv, si.duv_dx, si.duv_dy = mi.Point2f(uv), mi.Vector2f(du), mi.Vector2f(dv)
+    si.wi = vector(mi.Vector3f, wi)
+    u = suite.random_numbers(count, 3, seed=6)
+    bs, _ = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    m = dr.normalize(si.wi + bs.wo)
+    # glint_grid draws from the smooth surface, so D may be next to nothing: only on average is it
+    # the density of what is drawn.
+    drawn = bs.pdf * 4 * dr.abs(dr.dot(bs.wo, m)) / m.z
+    floor = drawn if isinstance(getattr(bsdf, "pndf", None), Grid) else drawn * 0
+    valid = np.array(bs.pdf) > 0
+    columns = (si.uv, si.duv_dx, si.duv_dy, si.wi, bs.wo, m.xy, floor)
+    return Queries(*(np.array(x)[..., valid] for x in columns))
+
+
+def double_error(bsdf: mi.BSDF, load: Callable[[], mi.BSDF], count: int) -> dict[str, float]:
+    """The same formulas in both precisions: ``error``, the mean of |a − b| / max(|a|, |b|).
+
+    ``load``: makes another ``bsdf``, here in float64.
+
+    ``last_digit`` is the same of float64 for a normal and a place that differ in the last digit of
+    float32: what no computation on such numbers can be blamed for.
+    """
+    asked = queries(bsdf, count)
+    single = np.float64(asked.value(bsdf, mi))
+    with double_precision() as names:
+        bsdf = load()
+        double = asked.value(bsdf, names)
+        m, uv = (np.nextafter(x, np.float32(2)) for x in (asked.m, asked.uv))
+        beside = replace(asked, m=m, uv=uv).value(bsdf, names)
+    if double.dtype != np.float64:
+        raise TypeError(f"computed in {double.dtype}")
+
+    def difference(a: Array) -> float:
+        larger = np.maximum(np.maximum(np.abs(a), np.abs(double)), asked.floor)
+        compared = larger != 0  # also where one is not a number
+        return float(np.mean(np.abs(a - double)[compared] / larger[compared]))
+
+    return {"error": difference(single), "last_digit": difference(beside)}
+
+
+# --------------------------------------------------------------------------------------------------
+#  A picture
+# --------------------------------------------------------------------------------------------------
+
+#: A power of two, about 10⁶: scaling by it changes no digit.
+BRIGHT = 2.0**20
+
+
+def scene_of_squares(bsdf: mi.BSDF) -> mi.Scene:
+    """Squares with ordinary, inverted and collapsed UVs, in the light of a lamp and a dim sky."""
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "glint_path", "max_depth": 3},
+        "sensor": {
+            "type": "perspective",
+            "fov": 50,
+            "to_world": mi.ScalarTransform4f().look_at([0.3, -3, 2.5], [0, 0, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}},
+            "sampler": {"type": "independent", "sample_count": 8},
+        },
+        "lamp": {
+            "type": "sphere",
+            "center": [0.2, 0.5, 2],
+            "radius": 0.3,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 1e-3}},
+    }
+    for k, texcoords in enumerate(
+        ([0, 0, 1, 0, 1, 1, 0, 1], [1, 0, 0, 0, 0, 1, 1, 1], [0, 0, 1, 1, 2, 2, 3, 3])
+    ):
+        scene[f"square_{k}"] = square(-1.1 + 1.1 * k, texcoords, bsdf)
+    return mi.load_dict(scene)
+
+
+def square(x: float, texcoords: list[float], bsdf: mi.BSDF) -> mi.Mesh:
+    """A unit square in the plane z = 0 with these UVs at its corners."""
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    mesh = mi.Mesh("square", 4, 2, has_vertex_texcoords=True, props=props)
+    parameters = mi.traverse(mesh)
+    corners = [(x - 0.5, -0.5, 0), (x + 0.5, -0.5, 0), (x + 0.5, 0.5, 0), (x - 0.5, 0.5, 0)]
+    parameters["vertex_positions"] = mi.Float(np.float32(corners).ravel())
+    parameters["vertex_texcoords"] = mi.Float(texcoords)
+    parameters["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+    parameters.update()
+    return mesh
+
+
+def bright_light(bsdf: mi.BSDF) -> dict[str, float]:
+    """A picture in light of 1 and of ``BRIGHT``: ``apart``, their relative L1 difference, scaled.
+
+    ``nan`` and ``negative`` count channels of pixels of the second.
+    """
+    scene = scene_of_squares(bsdf)
+    plain = np.array(mi.render(scene, seed=1), np.float64)
+    parameters = mi.traverse(scene)
+    for key in ("lamp.emitter.radiance.value", "sky.radiance.value"):
+        parameters[key] = BRIGHT * parameters[key]
+    parameters.update()
+    bright = np.array(mi.render(scene, seed=1), np.float64)
+    finite = np.isfinite(bright)
+    apart = np.abs(bright / BRIGHT - plain)[finite].sum() / np.abs(plain).sum()
+    return {
+        "apart": float(apart),
+        "nan": int((~finite).sum()),
+        "negative": int((bright < 0).sum()),
+    }
+
+
+def views(texels: float, quick: bool, large: bool) -> dict[str, View]:
+    """Views for densities of a map ``texels`` wide: from a point to a tenth of it, or to half."""
+    texel, slant = 1 / texels, (0.3, 0.1, 1)
+    chosen = {
+        "texels": View(du=(1.3 * texel, 0.7 * texel), dv=(-0.35 * texel, 0.65 * texel), wi=slant),
+        "needle": View(du=(4 * texel, 2.5 * texel), dv=(-0.025 * texel, 0.04 * texel), wi=slant),
+    }
+    if large:
+        chosen["half"] = View(du=(0.5, 0.1), dv=(-0.1, 0.4), wi=(0.1, 0, 1))
+    if quick:
+        return chosen
+    far = replace(chosen["texels"], uv=(1e6 + 0.3, -1e6 - 0.6), wi=(-1, 0.4, 0.5))
+    tenth = View(du=(0.1, 0.0), dv=(0.03, 0.1), wi=(0, 0, 1))
+    return chosen | {"point": View(wi=slant), "far": far, "tenth": tenth}
+
+
+def energy_views(texels: float) -> list[View]:
+    """Views for the energy: footprints of half a texel, of four texels and of the map."""
+    result = []
+    for k, sigma in enumerate((0.5 / texels, 4 / texels, 1.0)):
+        for n, inclination in enumerate((0, 60, 85, 89.9)):
+            azimuth = np.array(0.7 + 2.1 * n + 1.3 * k)
+            wi = direction(np.radians(np.array(inclination)), azimuth)
+            result.append(View(du=(sigma, 0), dv=(0, sigma), wi=tuple(wi.tolist())))
+    return result
