@@ -59,6 +59,15 @@ def test_errors_within_their_noise_are_none():
     assert pareto.fastest([point("sure", 2.0, 0.04)], 0.02) is None
 
 
+def test_the_first_among_equally_fast_is_named():
+    from report import pareto
+
+    points = [point("simple", 1.2, 0.04), point("other", 1.0, 0.04), point("slow", 1.4, 0.04)]
+    assert pareto.fastest(points, 0.05)["method"] == "simple"
+    assert pareto.fastest(points[1:], 0.05)["method"] == "other"
+    assert pareto.fastest(points[::-1], 0.05)["method"] == "other"
+
+
 def test_equal_times_are_interpolated_as_powers_and_never_beyond():
     from report import images
 

@@ -21,6 +21,9 @@ from .pndf import timed
 #: Radius of the lights: brute force finds the scene's own too seldom.
 LIGHT_RADIUS = 0.07
 
+#: Degrees: the patch fills the picture, and no light is seen but in it.
+FIELD_OF_VIEW = 30.0
+
 #: Standard deviation of a box of one pixel: footprints have the variance of the truth's pixels.
 FOOTPRINT_SIGMA = 12**-0.5
 
@@ -109,7 +112,13 @@ def load(material: Method | str, surface: Surface, scale: float, settings: Setti
         described = BASELINES[material](surface.normal_map, **shared)
     else:
         described = material.describe(surface) | shared | {"footprint_sigma": FOOTPRINT_SIGMA}
-    return curved_patch(described, settings.size, 1, LIGHT_RADIUS)
+    scene = curved_patch(described, settings.size, 1, LIGHT_RADIUS)
+    parameters = mi.traverse(scene)
+    parameters.keep([r".*x_fov$"])
+    (key,) = parameters.keys()
+    parameters[key] = FIELD_OF_VIEW
+    parameters.update()
+    return scene
 
 
 def renderers(methods: list[Method], surface: Surface, scale: float, settings: Settings):

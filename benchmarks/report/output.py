@@ -32,7 +32,7 @@ def write(folder: Path, machine: dict, described: dict, found: dict, console: Co
         for case in report["images"] for point in case["points"]
     ])  # fmt: skip
     drawn = draw(pictures, report)
-    write_text(folder / "report.html", page.html(report, drawn, thumbnails(report, found)))
+    write_text(folder / "report.html", page.html(report, drawn, thumbnails(report, found), picture))
     Console().print(table(report["which_when"]))
     console.print(f"{folder / 'report.html'} shows everything.")
     return report
@@ -84,23 +84,28 @@ def of_maps(units: list[dict]) -> dict[str, list[dict]]:
     return maps
 
 
+def picture(*parts: str) -> str:
+    """Name of a picture, without spaces."""
+    return "_".join(parts).replace(" ", "-")
+
+
 def draw(folder: Path, report: dict) -> dict[str, str]:
     """All pictures, as SVG by name."""
     palette = figures.Palette([method["family"] for method in report["methods"]])
     drawn = {}
     for name, units in of_maps(report["pndf"]).items():
         for metric in figures.METRICS:
-            title = f"pndf_{name}_{metric}"
+            title = picture("pndf", name, metric)
             drawn[title] = figures.draw(
                 folder, title, figures.errors, units, palette, metric, "seconds_per_query"
             )
-        title = f"pndf_{name}_memory"
+        title = picture("pndf", name, "memory")
         drawn[title] = figures.draw(folder, title, figures.errors, units, palette, "l1", "bytes")
     drawn["pndf_cost"] = figures.draw(
         folder, "pndf_cost", figures.cost, of_maps(report["pndf"]), palette
     )
     for case in report["images"]:
-        title = f"images_{case['map']}_{case['scale']:g}"
+        title = picture("images", case["map"], f"{case['scale']:g}")
         names = list(dict.fromkeys(point["method"] for point in case["points"]))
         drawn[title] = figures.draw(
             folder, title, figures.images, case["points"], case["truth"]["noise"], names

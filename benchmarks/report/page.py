@@ -16,8 +16,11 @@ from glintbsdf.pndf_plot import colour_map
 _GAMMA = 0.5
 
 
-def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str]) -> str:
-    """The page of a report. ``drawn`` are SVG texts, ``thumbnails`` data URIs."""
+def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str], picture) -> str:
+    """The page of a report.
+
+    ``drawn`` are SVG texts by the names that ``picture`` gives them, ``thumbnails`` data URIs.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -29,6 +32,7 @@ def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str]) -> str
         report=report,
         figures={name: jinja2.utils.markupsafe.Markup(svg) for name, svg in drawn.items()},
         thumbnails=thumbnails,
+        picture=picture,
     )
 
 
