@@ -173,7 +173,12 @@ from __future__ import annotations
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.microfacet import BeckmannMasking, MapBeckmannMasking
+from glintbsdf.microfacet import (
+    BeckmannMasking,
+    FlakesBeckmannLobe,
+    MapBeckmannLobe,
+    MapBeckmannMasking,
+)
 from glintbsdf.parameters import MAP_SOURCES, Parameters
 from glintbsdf.pndf import Elements, Flakes
 
@@ -209,6 +214,8 @@ class GlintElements(GlintBSDF):
                 if isinstance(self.pndf, Flakes)
                 else MapBeckmannMasking(self.pndf)
             )
+        smooth = FlakesBeckmannLobe if isinstance(self.pndf, Flakes) else MapBeckmannLobe
+        self.smooth = smooth(self.pndf)
 
 
 mi.register_bsdf("glint_elements", lambda props: GlintElements(props))

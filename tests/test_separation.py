@@ -119,6 +119,21 @@ def test_smooth_lobe_has_the_intrinsic_roughness(variant, plugin):
     )
 
 
+def test_smooth_lobe_of_flakes(variant):
+    """Also after their intrinsic roughness has changed."""
+    flakes = {"type": "glint_elements", "flake_density": 100.0, "flake_alpha": 0.2}
+    theirs = {"type": "roughconductor", "alpha": float(np.sqrt(0.2**2 + 2 * 0.05**2))}
+    assert_same({**flakes, "sigma_r": 0.05}, theirs)
+    bsdf = mi.load_dict(flakes)
+    parameters = mi.traverse(bsdf)
+    parameters["sigma_r"] = 0.05
+    parameters.update()
+    wo = dr.normalize(mi.Vector3f(0.2, 0.1, 1))
+    value = bsdf.eval(smooth_context(), VIEW.interaction(1), wo)
+    expected = mi.load_dict(theirs).eval(mi.BSDFContext(), VIEW.interaction(1), wo)
+    assert np.allclose(value, expected, rtol=5e-3)
+
+
 def test_smooth_lobe_of_a_flat_map(variant):
     """Mitsuba's smallest roughness, 1e-4, and nothing that is not finite."""
     flat = NormalMap(np.zeros((4, 4, 2), np.float32))

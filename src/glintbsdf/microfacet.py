@@ -340,8 +340,8 @@ class MapBeckmannLobe(BeckmannLobe):
     """The smooth surface as rough as a whole map: what its glints add up to, from afar.
 
     The squared roughness is that of :class:`MapBeckmannMasking`, twice the mean squared slope along
-    u and along v, plus 2σ_r² for the intrinsic roughness of elements and lobes. A tilt of the map as
-    a whole counts as roughness, and the two axes as uncorrelated. A flat map has the smallest
+    u and along v, plus 2σ_r² for the intrinsic roughness of elements and lobes. A tilt of the map
+    as a whole counts as roughness, and the two axes as uncorrelated. A flat map has the smallest
     roughness, 1e-4.
 
     Args:
@@ -355,8 +355,22 @@ class MapBeckmannLobe(BeckmannLobe):
 
     def parameters_changed(self) -> None:
         intrinsic = 2 * dr.square(getattr(self.pndf, "sigma_r", 0.0))
-        alpha_squared = map_alpha_squared(self.pndf.data) + intrinsic
-        super().__init__(dr.sqrt(dr.maximum(alpha_squared, 1e-8)))
+        super().__init__(dr.sqrt(dr.maximum(self.alpha_squared() + intrinsic, 1e-8)))
+
+    def alpha_squared(self) -> mi.Vector2f:
+        """Squared roughness along u and v, without the intrinsic one."""
+        return map_alpha_squared(self.pndf.data)
+
+
+class FlakesBeckmannLobe(MapBeckmannLobe):
+    """The smooth surface as rough as all flakes together: ``pndf.alpha``, and their own roughness.
+
+    Args:
+        pndf: as of :class:`MapBeckmannLobe`, of flakes instead of a map.
+    """
+
+    def alpha_squared(self) -> mi.Vector2f:
+        return mi.Vector2f(self.pndf.alpha**2)
 
 
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
