@@ -140,6 +140,7 @@ def decades(first: int, last: int) -> tuple[float, ...]:
 
 
 NO_MAP = ("none",)
+FLAKES = {"flake_density": 1e3, "flake_alpha": 0.2}
 #: A map of twice the sample's side; samples must be larger than a patch.
 SMALL_MIP = {"output_size": 2 * SIZE, "patch_size": SIZE // 2, "overlap": 4, "clusters": 8}
 SQUARE_MAPS = tuple(MAPS)[:6]
@@ -161,6 +162,7 @@ METHODS: dict[str, Method] = {
     "manifold, hand_over": Method("glint_manifold", {"hand_over": 0.7}),
     "elements": Method("glint_elements", {}, VERTICAL, ("sigma_r", decades(-8, 0))),
     "elements, flat": Method("glint_elements", {"elements": "flat", "step": 2.0}, VERTICAL),
+    "elements, flakes": Method("glint_elements", FLAKES, VERTICAL, maps=NO_MAP),
     "mip": Method(
         "glint_mip", SMALL_MIP, VERTICAL, ("sigma_r", decades(-8, 0)), SQUARE_MAPS, large=True
     ),
@@ -303,13 +305,16 @@ def in_a_line(error: Exception) -> str:
 
 
 def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
-    """Texels, or cells of the finest grid, per unit of UV, and how far apart places are to lie.
+    """Texels, flakes or finest cells per unit of UV, and how far apart places are to lie.
 
     Only on average over places does ``glint_grid`` keep the energy.
     """
-    if row.map in NO_MAP:
+    method = METHODS[row.method]
+    if method.plugin == "glint_grid":
         cells = float(bsdf.pndf.scale[0])
         return cells, 1e4 / cells
+    if row.map in NO_MAP:
+        return method.parameters["flake_density"] ** 0.5, 0.0
     return max(normal_map_of(row.map).normals.shape[:2]), 0.0
 
 
