@@ -88,8 +88,8 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
     seen = {}
     for axis, unit in zip(axes, units, strict=True):
         points = [point for point in unit["points"] if point[cost] > 0]
-        on_front = set(pareto.front(points, cost, metric))
-        front = sorted((p for p in points if p["method"] in on_front), key=lambda p: p[cost])
+        front = pareto.front(points, cost, metric)
+        on_front = {point["method"] for point in front}
         axis.plot(
             [scale * p[cost] for p in front],
             [p[metric] for p in front],

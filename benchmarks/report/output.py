@@ -31,9 +31,10 @@ def write(folder: Path, machine: dict, described: dict, found: dict, console: Co
         {"map": case["map"], "scale": case["scale"], **point}
         for case in report["images"] for point in case["points"]
     ])  # fmt: skip
+    write_csv(folder / "which_when.csv", fastest(report["which_when"]))
     drawn = draw(pictures, report)
     write_text(folder / "report.html", page.html(report, drawn, thumbnails(report, found), picture))
-    Console().print(table(report["which_when"]))
+    Console().print(fronts(report["which_when"]))
     console.print(f"{folder / 'report.html'} shows everything.")
     return report
 
@@ -150,21 +151,32 @@ def write_csv(path: Path, rows: list[dict]) -> None:
         writer.writerows(rows)
 
 
-def table(rows: list[dict]) -> Table:
-    """The fastest method per map, footprint and tolerated error."""
-    found = Table(title="The fastest method whose relative L1 error is at most …")
+def fronts(rows: list[dict]) -> Table:
+    """The front of error against time per map and footprint."""
+    found = Table(title="What no other method beats in both time per query and relative L1 error")
     found.add_column("map")
     found.add_column("r (texels)", justify="right")
-    for tolerance in pareto.TOLERANCES:
-        found.add_column(f"{tolerance:.0%}")
-    last = None
+    found.add_column("µs", justify="right")
+    found.add_column("error", justify="right")
+    found.add_column("method")
     for row in rows:
-        cells = [
-            "–"
-            if cell["method"] is None
-            else f"{cell['method']} ({1e6 * cell['seconds_per_query']:.2g} µs)"
-            for cell in row["fastest"]
-        ]
-        found.add_row(row["map"] if row["map"] != last else "", f"{row['radius']:g}", *cells)
-        last = row["map"]
+        for position, point in enumerate(row["front"]):
+            where = ("", "") if position else (row["map"], f"{row['radius']:g}")
+            told = point["l1"] > pareto.TELLABLE * point["noise_l1"]
+            found.add_row(
+                *where,
+                f"{1e6 * point['seconds_per_query']:.2g}",
+                f"{point['l1']:.1%}" if told else "noise",
+                point["method"],
+            )
+        found.add_section()
     return found
+
+
+def fastest(rows: list[dict]) -> list[dict]:
+    """Rows for a table of the fastest method per map, footprint and tolerated error."""
+    return [
+        {"map": row["map"], "r (texels)": f"{row['radius']:g}"}
+        | {f"≤ {cell['tolerance']:.0%}": cell["method"] or "–" for cell in row["fastest"]}
+        for row in rows
+    ]

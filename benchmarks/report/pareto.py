@@ -18,13 +18,13 @@ def excess(point: dict, metric: str = "l1") -> float:
     return point[metric] if point[metric] > TELLABLE * point[f"noise_{metric}"] else 0.0
 
 
-def front(points: list[dict], cost: str = "seconds_per_query", metric: str = "l1") -> list[str]:
-    """Names of the methods that no other beats in both cost and error, cheapest first."""
+def front(points: list[dict], cost: str = "seconds_per_query", metric: str = "l1") -> list[dict]:
+    """The points that no other beats in both cost and error, cheapest first."""
     found, best = [], float("inf")
     for point in sorted(points, key=lambda point: (point[cost], excess(point, metric))):
         if excess(point, metric) < best:
             best = excess(point, metric)
-            found.append(point["method"])
+            found.append(point)
     return found
 
 
@@ -37,18 +37,23 @@ def fastest(points: list[dict], tolerance: float) -> dict | None:
 
 def which_when(units: list[dict]) -> list[dict]:
     """One row per map and footprint: the front, and the fastest method for each tolerance."""
-    rows = []
-    for unit in units:
-        row = {"map": unit["map"], "radius": unit["radius"], "front": front(unit["points"])}
-        row["fastest"] = []
-        for tolerance in TOLERANCES:
-            point = fastest(unit["points"], tolerance)
-            row["fastest"].append(
+    return [
+        {
+            "map": unit["map"],
+            "radius": unit["radius"],
+            "front": [
+                {key: point[key] for key in ("method", "seconds_per_query", "l1", "noise_l1")}
+                for point in front(unit["points"])
+            ],
+            "fastest": [
                 {
                     "tolerance": tolerance,
                     "method": None if point is None else point["method"],
                     "seconds_per_query": None if point is None else point["seconds_per_query"],
                 }
-            )
-        rows.append(row)
-    return rows
+                for tolerance in TOLERANCES
+                for point in [fastest(unit["points"], tolerance)]
+            ],
+        }
+        for unit in units
+    ]
