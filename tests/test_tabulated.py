@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
+import bsdf_suite as suite
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_suite import EXTREME_VIEWS, View, check_chi2, check_finite, check_weights
+from bsdf_suite import View
 
 from glintbsdf import maps
 from glintbsdf.errors import ParameterError
@@ -120,7 +122,7 @@ def test_mass_is_one(variant, shape, wrap_mode):
     normal_map = maps.isotropic(shape, correlation_length=3, seed=2)
     normal_map = type(normal_map)(normal_map.normals, wrap_mode)
     pndf = TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.2)
-    for sigma in (10, 20, 60):
+    for sigma in (10, 20, 60, 1000):  # the last one as large as the map
         view = footprint(sigma, size=shape[::-1])
         assert pndf.level(view).numpy().item() >= 0
         mass = density_of_bins(pndf, view).sum() * pndf.tables.bins.area
@@ -257,21 +259,41 @@ def test_max_error_must_be_positive(variant, normal_map, max_error):
 # ---------------------------------------------------------------------------------------------
 
 
+#: Footprints of 19 texels.
+VIEW = View(du=(0.15, 0.02), dv=(-0.02, 0.2))
+
+
+def load(normal_map, **parameters):
+    described = {
+        "type": "glint_manifold",
+        "data": mi.TensorXf(normal_map.normals),
+        "epsilon": EPSILON,
+        "masking": "none",
+        "footprint_sigma": 1.0,
+    }
+    return mi.load_dict({**described, **parameters})
+
+
 @pytest.mark.parametrize("max_error", [0.01, 0.05, 0.2])
-def test_bsdf(variant, normal_map, max_error):
-    bsdf = mi.load_dict(
-        {
-            "type": "glint_manifold",
-            "data": mi.TensorXf(normal_map.normals),
-            "epsilon": EPSILON,
-            "max_error": max_error,
-            "masking": "none",
-            "footprint_sigma": 1.0,
-        }
-    )
-    view = View(du=(0.15, 0.02), dv=(-0.02, 0.2))
+def test_shared_suite(variant, normal_map, max_error):
+    bsdf = load(normal_map, max_error=max_error)
+    assert bsdf.pndf.level(bsdf.footprint(VIEW.interaction())).numpy().item() >= 0
     lower, upper = (tuple(map(float, v)) for v in bsdf.pndf.bounds())
-    check_chi2(bsdf, view, (lower, upper), test_count=3)
-    check_weights(bsdf, view)
-    for extreme in EXTREME_VIEWS.values():
-        check_finite(bsdf, extreme)
+    suite.check_chi2(bsdf, VIEW, (lower, upper), test_count=3)
+    for view in (VIEW, suite.EXTREME_VIEWS["1000:1"]):
+        suite.check_eval_pdf(bsdf, view, 500)
+        suite.check_weights(bsdf, view, 500)
+        suite.check_horizon(bsdf, view, 200)
+    suite.check_furnace(bsdf, replace(VIEW, wi=(0, 0, 1)))
+    for extreme in suite.EXTREME_VIEWS.values():
+        suite.check_finite(bsdf, extreme)
+
+
+def test_derivative_of_the_value(variant, normal_map):
+    suite.check_derivative(load(normal_map, max_error=0.05), VIEW, "footprint_sigma")
+
+
+def test_other_variants(each_variant, normal_map):
+    bsdf = load(normal_map, max_error=0.05)
+    suite.check_weights(bsdf, VIEW, 500)
+    suite.check_finite(bsdf, VIEW)

@@ -101,9 +101,8 @@ def level_counts(count: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def count_near(wanted: float) -> int:
-    """The largest number of nodes ≤ ``wanted`` that has no prime factors but 2, 3 and 5, ≥ 1."""
-    smooth = (2**i * 3**j * 5**k for i in range(17) for j in range(4) for k in range(2))
-    return max((n for n in smooth if n <= wanted), default=1)
+    """The largest number of nodes ≤ ``wanted``, at least 1, that can be halved often enough."""
+    return max((m << k for m in (1, 3, 5, 9, 15) for k in range(17) if m << k <= wanted), default=1)
 
 
 def tile_order(count: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
