@@ -124,13 +124,15 @@ where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\
 :ref:`glint_manifold <bsdf-glint_manifold>`, it is smooth: roughness :math:`\sigma_r` is part of it.
 
 Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,
-and the lists of elements by normal, which large footprints are evaluated with, up to 42.
+and the lists of elements by normal, from which large footprints are evaluated, up to 90, or 42 with
+a :monosp:`step` of 1. The cost grows with the area of the footprint.
 
-The sum is cut where elements weigh little: at 3 to 4 standard deviations of the footprint, and of
-the normals of an element; the integral of :math:`D` is one within 1e-3.
+The sum is cut where elements weigh little: 3 standard deviations from the footprint's centre, where
+they fade, and 3.7 from the mean of an element's normals. The integral of :math:`D` is one within
+1e-3 for every footprint.
 
-Flakes share the whole surface among them. What shows between flakes is for a blend with another
-material to say.
+Flakes share the whole surface among them: seen from afar they cover it evenly, and a point shows
+the nearest ones. To let a base coat show between them, blend with its material (``blendbsdf``).
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

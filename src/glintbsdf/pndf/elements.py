@@ -175,7 +175,7 @@ class Mixture:
         """Normal and Jacobian of the seed with these indices."""
         raise NotImplementedError
 
-    def kernel(self, footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
+    def weights(self, footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
         """N(0, T), which weighs the elements, in cells; whether to sum all that it covers; and ρ²
         of its cut."""
         columns, rows = self.map_cells
@@ -199,7 +199,7 @@ class Mixture:
 
         ``footprint``: a :class:`~glintbsdf.footprint.Footprint`, in the UV space of the map.
         """
-        kernel, few, cut = self.kernel(footprint)
+        kernel, few, cut = self.weights(footprint)
         seen = self.seen(kernel)
         active = mi.Bool(active) & (dr.squared_norm(m) < 1)
 
@@ -241,7 +241,7 @@ class Mixture:
 
         A normal outside the disk is an invalid sample, as D is 0 there.
         """
-        kernel, _, cut = self.kernel(footprint)
+        kernel, _, cut = self.weights(footprint)
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
 
         def attempt(count, x, y, offset, active):
@@ -324,6 +324,9 @@ class Elements(Mixture):
 
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
+
+    # What others ask a P-NDF of a normal map for: roughness makes a clamp needless.
+    kernel, epsilon = "gaussian", 0.0
 
     def __init__(
         self,
