@@ -78,7 +78,7 @@ BOUNDS = ((-0.7, -0.7), (0.7, 0.7))
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_density(variant, name):
-    suite.check_chi2(load(), VIEWS[name], BOUNDS, DENSITY_TESTS, samples=50_000)
+    suite.check_chi2(load(), VIEWS[name], BOUNDS, DENSITY_TESTS, samples=50_000, res=17)
 
 
 @pytest.mark.parametrize("name", STIFF_SAMPLES)
@@ -86,7 +86,7 @@ def test_density_of_stiff_samples(variant, name):
     bsdf = load(STIFF_SAMPLES[name])
     for sigma in (1.0, 9.0):
         seen = view(sigma, uv=(1.01, 0.02))  # across the border
-        suite.check_chi2(bsdf, seen, BOUNDS, DENSITY_TESTS, samples=50_000)
+        suite.check_chi2(bsdf, seen, BOUNDS, DENSITY_TESTS, samples=50_000, res=17)
 
 
 @pytest.mark.parametrize("name", ["texels", "grids and cells", "whole map"])
@@ -168,7 +168,7 @@ def test_a_uniform_sample_works_and_says_so(variant):
     with pytest.warns(UserWarning, match="glint_mip: the sample has 1 distinct normals"):
         bsdf = load(maps.tilted(40, 0.2))
     for seen in (VIEWS["texels"], VIEWS["grids and cells"]):
-        suite.check_chi2(bsdf, seen, BOUNDS, 1, samples=20_000)
+        suite.check_chi2(bsdf, seen, BOUNDS, 1, samples=20_000, res=17)
         # All normals are the one of the sample, within σ_r
         normal = mi.Vector2f(*maps.tilted(1, 0.2).normals[0, 0].tolist())
         peak = suite.density(bsdf, seen, normal)

@@ -35,8 +35,12 @@ SMALLEST_GRID = 12
 #: Iterations of k-means.
 ITERATIONS = 8
 
+#: Standard deviations of a lobe's normals that count at most: those that a footprint sees may lie
+#: :data:`~glintbsdf.pndf.packed_lobes.CUT` of them off its mean, and vary about that.
+SPREADS = packed_lobes.CUT + packed_lobes.NORMAL_CUT
+
 #: Of what :func:`build` returns; part of the cache's key.
-VERSION = 2
+VERSION = 3
 
 
 @dataclass
@@ -197,7 +201,9 @@ def build(
         ``texels``: packed lobes of the sample's texels; ``inside``: those inside patches, patch by
         patch, division by division, row by row of the grids; ``overlaps``: those of the cells'
         overlaps; ``segments``, (n² + 1) per cell: where in them each grid of the finest division
-        begins, in Morton order; ``cells``: those of cells and groups of cells, level by level.
+        begins, in Morton order; ``cells``: those of cells and groups of cells, level by level;
+        ``normals``, per level: the rectangle (lower, upper) of the lobes' normals, to
+        :data:`SPREADS` standard deviations.
         Unless there are divisions, ``inside``, ``overlaps`` and ``segments`` are empty.
     """
     layout = Layout.of(synthesis)
@@ -219,8 +225,22 @@ def build(
         "inside": inside.packed(step),
         "overlaps": overlaps.packed(step),
         "segments": segments,
+        "normals": np.array(
+            [normal_bounds(texels)]
+            + [normal_bounds(inside, overlaps)] * len(layout.divisions)
+            + [normal_bounds(level) for level in levels]
+        ),
         "cells": np.concatenate([level.packed(step * 2**j) for j, level in enumerate(levels)]),
     }
+
+
+def normal_bounds(*parts: Lobes) -> np.ndarray:
+    """Lower and upper corner of a rectangle that holds the normals of lobes, 2×2."""
+    lobes = Lobes.concatenate(list(parts))
+    lobes = lobes[lobes.mass > 0]
+    reach = SPREADS * np.sqrt(np.einsum("ijj->ij", lobes.covariance)[:, 2:])
+    mean = lobes.mean[:, 2:]
+    return np.stack(((mean - reach).min(axis=0), (mean + reach).max(axis=0)))
 
 
 def all_words(arrays: dict[str, np.ndarray]) -> np.ndarray:

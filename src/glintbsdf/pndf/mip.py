@@ -31,7 +31,7 @@ from ..synthesis import Synthesis, check_sizes, check_whole, synthesise
 from . import lobe_levels, packed_lobes
 from .manifold import add_where
 from .mip_grids import Grids
-from .packed_lobes import Lobe
+from .packed_lobes import NORMAL_CUT, Lobe
 
 #: Width of a footprint, in standard deviations, that of a pixel: its area in Eq. 8 is that of a
 #: square as wide.
@@ -39,9 +39,6 @@ WIDTH = 2.0
 
 #: A footprint more elongated than this counts as wider in Eq. 8, which limits the cost.
 MAX_ANISOTROPY = 16.0
-
-#: Standard deviations beyond which a lobe's normals are left out: 4e-5 of its mass at most.
-NORMAL_REACH = 4.5
 
 
 class Mip:
@@ -303,6 +300,7 @@ class Mip:
     def level_density(self, m, footprint, kernel, level, active) -> mi.Float:
         """D(m) of one level."""
         variance = dr.square(self.sigma_r)
+        active = active & self.grids.may_have(m, level, NORMAL_CUT * self.sigma_r, active)
 
         def add(state, lobe, d, sign, active):
             density, mass = state
@@ -312,7 +310,7 @@ class Mip:
                 return weight * lobe.normals(d).eval(m, variance)
 
             # The mean moves with the footprint by less than the spread times √distance.
-            far = lobe.spread * dr.sqrt(distance) + NORMAL_REACH * dr.sqrt(
+            far = lobe.spread * dr.sqrt(distance) + NORMAL_CUT * dr.sqrt(
                 dr.fma(lobe.spread, lobe.spread, variance)
             )
             near = (weight > 0) & (dr.squared_norm(m - lobe.mean_normal()) < dr.square(far))

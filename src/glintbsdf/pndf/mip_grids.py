@@ -150,12 +150,18 @@ class Grids:
         step = float(np.diff(synthesis.starts).max())
         extents = [1.0, *(step for _ in layout.divisions)]
         self.extent = mi.Float(extents + [step * 2**j for j in range(len(layout.cells))])
+        self.normals = mi.Float(arrays["normals"].astype(np.float32).ravel())
 
     @property
     def nbytes(self) -> int:
         """Memory of the tables, bytes; the lobes are not counted."""
         tables = (self.patch, self.origins, self.owners, self.segments)
         return 4 * sum(dr.width(v) for v in tables) + self.x.nbytes
+
+    def may_have(self, m: mi.Vector2f, level, margin: mi.Float, active) -> mi.Bool:
+        """Whether ``m`` is within the ``margin`` of normals that lobes of the level have."""
+        lower, upper = (dr.gather(mi.Vector2f, self.normals, 2 * level + k, active) for k in (0, 1))
+        return dr.all((m > lower - margin) & (m < upper + margin))
 
     def run(self, level, row: AxisLevel, column: AxisLevel, y, x, flipped, active):
         """The lobes of the stored grid (``y``, ``x``): ``(first, count, first_2, count_2)``.

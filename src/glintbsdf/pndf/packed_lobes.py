@@ -29,6 +29,9 @@ from ..gaussian_lobes import Gaussian
 #: of the mass.
 CUT = 3.5
 
+#: Standard deviations beyond which normals of a lobe are left out: 4e-5 of its mass at most.
+NORMAL_CUT = 4.5
+
 #: Version of the format, part of the keys of caches.
 VERSION = 1
 
