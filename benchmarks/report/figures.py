@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from . import pareto
@@ -15,6 +16,10 @@ from . import pareto
 #: Okabe and Ito's colours, told apart by all eyes, and markers, by family in order of appearance.
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#000000", "#999999")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+#: Marks of errors that are told from the noise of their measurement, and of those that are not.
+TOLD = {"markeredgecolor": "white", "markeredgewidth": 0.5}
+NOT_TOLD = {"markerfacecolor": "white", "markeredgewidth": 1.2}
 
 METRICS = {"l1": "relative L1 error", "l2": "relative L2 error", "maximum": "maximum error"}
 
@@ -79,7 +84,10 @@ def panels(count: int, width: float = 3.1, height: float = 2.7, most: int = 5):
 
 
 def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: str) -> Figure:
-    """Error against ``cost`` for one map, one panel per footprint; a point's id is its ``id``."""
+    """Error against ``cost`` for one map, one panel per footprint; hollow where only noise.
+
+    Lines at the bottom are the noise of the references, points on the front larger.
+    """
     figure, axes = panels(len(units))
     scale, label = {
         "seconds_per_query": (1e6, "time per query (µs)"),
@@ -118,8 +126,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
                     palette.marker[family],
                     color=palette.colour[family],
                     markersize=6 if point["method"] in on_front else 4.5,
-                    markeredgecolor="white",
-                    markeredgewidth=0.5,
+                    **(TOLD if pareto.excess(point, metric) else NOT_TOLD),
                     zorder=3,
                     gid=f"{name}--{point['id']}",
                 )
@@ -128,7 +135,11 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
         logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel(label)
     axes[0].set_ylabel(METRICS[metric])
-    figure.legend(seen.values(), seen.keys(), loc="outside lower center", ncols=len(seen))
+    solid = {
+        family: Line2D([], [], linestyle="", marker=palette.marker[family], color=mark.get_color())
+        for family, mark in seen.items()
+    }
+    figure.legend(solid.values(), solid.keys(), loc="outside lower center", ncols=len(solid))
     return figure
 
 
