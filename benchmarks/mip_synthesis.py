@@ -4,9 +4,9 @@
 
 Table 2 of Tan22: the memory of lobes and look-up table for a sample of 256² texels made 4096² (the
 paper: 27.4 MB), and 512² made 7168² (75.8 MB); with the time that it takes to build them, the cache
-being off. Then the seams: the squared difference (Eq. 7) of neighbouring texels of the map across the
-overlaps, over that inside of patches, for samples and overlaps; and how much of the map repeats:
-the largest share of cells that show the same patch. With -o, pictures of the maps.
+being off. Then the seams: the squared difference (Eq. 7) of neighbouring texels of the map across
+the overlaps, over that inside of patches, for samples and overlaps; and how much of the map
+repeats: the largest share of cells that show the same patch. With -o, pictures of the maps.
 
 Expected before measuring: 20 and 70 MB, 15 and 60 seconds (the paper takes 10 to 35 minutes). Seams
 of rough samples no rougher than inside; of smooth ones several times, with two texels of overlap,
@@ -63,7 +63,7 @@ def storage(sample: int, size: int) -> dict:
 
 
 def seams(name: str, sample: NormalMap, size: int, patch: int, overlap: int, folder) -> dict:
-    """Roughness across the overlaps over that inside, in the mean and the 99th percentile of Eq. 7."""
+    """Roughness across overlaps over that inside: mean and 99th percentile of Eq. 7."""
     synthesis = synthesise(sample, size, patch, overlap)
     normals = synthesis.explicit()
     features = lobe_features(normals, 0.9)
