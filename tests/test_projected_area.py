@@ -498,3 +498,22 @@ def test_derivative_is_that_of_the_value(variant):
         h = 3e-4
         difference = (value(mi.Float(h)) - value(mi.Float(-h)))[0] / (2 * h)
         assert dr.grad(t)[0] == pytest.approx(difference, rel=5e-3)
+
+
+@pytest.mark.parametrize("parameters", [{"threshold": 3.0}, {"max_error": 0.2}], ids=str)
+def test_analytic_masking_of_approximate_pndfs(variant, parameters):
+    # Masking looks at the map's own facets, whatever stands for them in the P-NDF.
+    normal_map = maps.isotropic(128, seed=1)
+    view = View(du=(0.12, 0.04), dv=(-0.04, 0.12), wi=(1, 0.5, 0.4))
+    masked, unmasked = (
+        glints(normal_map, masking=masking, height_correlated=False, **parameters)
+        for masking in ("analytic", "none")
+    )
+    si, bs, weight = suite.sample(masked, view, 100)
+    _, same, more = suite.sample(unmasked, view, 100)
+    assert dr.allclose(bs.wo, same.wo) and dr.any(bs.pdf > 0)
+    area = ProjectedArea(TexelMesh(normal_map))
+    footprint = Footprint(si.uv, si.duv_dx, si.duv_dy)
+    g = ProjectedAreaMasking(area, False).eval(si.wi, bs.wo, footprint, bs.pdf > 0)
+    assert dr.allclose(weight, dr.select(bs.pdf > 0, more * g, 0), rtol=1e-4)
+    assert dr.mean(g)[0] < 0.999
