@@ -102,6 +102,12 @@ def test_nan_breaks_every_bound(stability, column):
     assert stability.Judge(10).cells(result)[column].broken
 
 
+def test_what_is_not_resolved_is_not_judged(stability):
+    result = BROKEN["float64"] | BROKEN["NaN"] | {"errors": {}, "resolved": False}
+    cells = stability.Judge(10).cells(result)
+    assert cells["float64"] == stability.Cell("(2.0e-03)") and cells["NaN"].broken
+
+
 def test_what_fails_is_named(stability, tmp_path):
     row = stability.Row("lean", "flat", "alpha", -1.0, quick=True)
     status, text = run(stability, [row], tmp_path)
