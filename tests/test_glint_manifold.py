@@ -470,3 +470,19 @@ def test_describes_itself(variant):
     text = str(load(MAPS["isotropic"], material="Al", masking="beckmann"))
     for part in ("GlintManifold", "36", "29", "beckmann", "Conductor", "footprint_sigma = 1"):
         assert part in text
+
+
+def test_level_bump_map(variant):
+    """Where Mitsuba's own frame is not a number there is no light, rather than NaN."""
+    level = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((2, 2, 1), np.float32)), "raw": True}
+    glint = {"type": "glint_manifold", "data": mi.TensorXf(MAPS["isotropic"].normals)}
+    bsdf = mi.load_dict({"type": "bumpmap", "texture": level, "nested": glint})
+    si = RESOLVED.interaction(100)
+    si.dp_du, si.dp_dv, si.n = mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0), mi.Normal3f(0, 1, 0)
+    si.sh_frame = mi.Frame3f(si.dp_du, si.dp_dv, si.n)
+    u = suite.random_numbers(100, 5, seed=3)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(*u[1:3]))
+    wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(*u[3:]))
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
+    for x in (weight, bs.pdf, value, pdf):
+        assert dr.all(x == 0, axis=None)

@@ -273,6 +273,9 @@ class GlintBSDF(FootprintBSDF):
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
             return mi.Spectrum(0), mi.Float(0)
 
+        # The bumpmap of Mitsuba 3.9 hands over NaN where its relief is level and dp_du the z axis.
+        active &= dr.isfinite(si.wi.x)
+
         # Lanes below the horizon compute a harmless reflection along the normal: a NaN in a lane
         # that is masked away would still reach its derivatives.
         up = mi.Vector3f(0, 0, 1)
