@@ -27,6 +27,9 @@ from .progress import progress
 #: Patches to choose from, in sample areas: each texel of the sample is in so many of them.
 REUSE = 24
 
+#: Of the maps that come of the same parameters; part of the keys of caches.
+VERSION = 2
+
 #: What the owner of a texel in an overlap is called: the cell before in x, in y, or both.
 BEFORE_X, BEFORE_Y = 1, 2
 
@@ -268,7 +271,8 @@ def synthesise(
 
     Patches are chosen from :data:`REUSE` × sample area / patch area places in the sample, drawn at
     random, or from all places where there are fewer: structures built per patch, such as those of
-    :class:`~glintbsdf.pndf.Mip`, then stay small whatever the output's size.
+    :class:`~glintbsdf.pndf.Mip`, then stay small whatever the output's size. No cell shows much of
+    what its neighbours show, for the eye is quick to find what repeats side by side.
 
     Args:
         sample: the small map.
@@ -380,6 +384,7 @@ class _Quilt:
                 total[these] += strip.total_errors(there, weight)
         mean = total / np.maximum(counted.sum(axis=(1, 2)), 1)[:, None]
 
+        mean[self.repeats(y, x)] = np.inf
         allowed = mean <= tolerance * self.inside_error
         none = ~allowed.any(axis=1)
         self.best_only += int(none.sum())
@@ -398,6 +403,19 @@ class _Quilt:
         code = code + (np.arange(self.side) >= self.steps[x, None])[:, None, :] * np.uint8(BEFORE_X)
         cell, i, j = np.nonzero(mine)
         self.owner[rows[cell, i], columns[cell, j]] = code[cell, i, j]
+
+    def repeats(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Which patches show much of what one of a cell's neighbours shows already: N×P.
+
+        Those whose place in the sample is less than half a patch off along both axes; without a
+        choice, none.
+        """
+        result = np.zeros((len(y), len(self.origins)), bool)
+        for above, beside in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
+            neighbour = self.patch[(y + above) % self.count, (x + beside) % self.count]
+            offset = np.abs(self.origins[neighbour][:, None] - self.origins)
+            result |= (offset < self.side / 2).all(axis=2) & (neighbour >= 0)[:, None]
+        return result & ~result.all(axis=1, keepdims=True)
 
     def source(self, row, column) -> np.ndarray:
         """Index of the sample's texel that a texel shows by now, anything where none is placed."""

@@ -27,6 +27,7 @@ from ..gaussian_lobes import SIGMA_H
 from ..hashing import pcg3d, uniform
 from ..kernels import SIGMA_MIN, TexelKernel
 from ..normalmap import NormalMap
+from ..synthesis import VERSION as MAP_VERSION
 from ..synthesis import Synthesis, check_sizes, check_whole, synthesise
 from . import lobe_levels, packed_lobes
 from .manifold import add_where
@@ -122,10 +123,13 @@ class Mip:
                 stacklevel=2,
             )
         options = {**self.options, "toroidal": self.wrap_mode == "repeat"}
-        synthesis_key = " ".join(f"{name}={value!r}" for name, value in options.items())
-        key = (
-            f"mip {lobe_levels.VERSION}.{packed_lobes.VERSION} {sample.content_hash} "
-            f"{synthesis_key} {self.clusters} {self.normal_weight}"
+        key = " ".join(
+            (
+                f"mip {MAP_VERSION}.{lobe_levels.VERSION}.{packed_lobes.VERSION}",
+                sample.content_hash,
+                *(f"{name}={value!r}" for name, value in options.items()),
+                f"{self.clusters} {self.normal_weight}",
+            )
         )
 
         def build() -> dict:
