@@ -114,9 +114,10 @@ def test_furnace(variant):
         suite.check_furnace(bsdf, replace(VIEWS[name], wi=(0, 0, 1)))
 
 
+@pytest.mark.parametrize("key", ["sigma_r", "footprint_sigma"])
 @pytest.mark.parametrize("name", ["texels", "grids and cells"])
-def test_derivative_of_roughness(variant, name):
-    suite.check_derivative(load(), VIEWS[name], "sigma_r")
+def test_derivatives(variant, name, key):
+    suite.check_derivative(load(), VIEWS[name], key)
 
 
 def test_other_variants(each_variant):

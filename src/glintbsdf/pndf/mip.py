@@ -23,6 +23,7 @@ import numpy as np
 
 from ..cache import load_or_build
 from ..errors import check
+from ..footprint import Footprint
 from ..gaussian_lobes import SIGMA_H
 from ..hashing import pcg3d, uniform
 from ..kernels import SIGMA_MIN, TexelKernel
@@ -34,7 +35,7 @@ from .manifold import add_where
 from .mip_grids import Grids
 from .packed_lobes import NORMAL_CUT, Lobe
 
-#: Width of a footprint, in standard deviations, that of a pixel: its area in Eq. 8 is that of a
+#: Width of a footprint in standard deviations, a pixel's by default: its area in Eq. 8 is that of a
 #: square as wide.
 WIDTH = 2.0
 
@@ -164,7 +165,7 @@ class Mip:
         added = SIGMA_MIN**2 if added is None else added + SIGMA_MIN**2
         wrap_mode = self.wrap_mode
         if wrap_mode == "clamp":
-            footprint = type(footprint)(dr.clip(footprint.uv, 0, 1), footprint.du, footprint.dv)
+            footprint = Footprint(dr.clip(footprint.uv, 0, 1), footprint.du, footprint.dv)
             wrap_mode = "mirror"
         return TexelKernel("gaussian", footprint, size, size, wrap_mode, added=(added, added))
 
@@ -178,7 +179,7 @@ class Mip:
         major = variance - kernel.minor_variance
         minor = dr.maximum(kernel.minor_variance, major * (1 / MAX_ANISOTROPY**2))
         area = WIDTH**2 * dr.sqrt(major * minor)
-        scaled = dr.detach(self.lod_scale * dr.log2(area)) - (self.finest_level - 1)
+        scaled = self.lod_scale * dr.log2(area) - (self.finest_level - 1)
         scaled = dr.clip(scaled, 0, self.grids.levels - 1)
         below = dr.floor(scaled)
         fraction = scaled - below
