@@ -147,8 +147,6 @@ class Clustering:
         count = len(features)
         if count <= self.clusters:
             return np.arange(count)
-        from scipy.cluster.vq import kmeans2  # only where something is built
-
         begin = features[self.rng.choice(count, self.clusters, replace=False)]
         from scipy.cluster.vq import kmeans2  # half a second that only those pay who build
 
