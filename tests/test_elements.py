@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.spatial
 
 from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.errors import ParameterError
@@ -68,9 +69,10 @@ def mixture(normal_map, step, sigma_r, curved, m, sigma_p):
     d = centre - np.stack([x, y], 1)
     rho2 = np.einsum("ni,ij,nj->n", d, np.linalg.inv(t), d)
     sigma = np.sqrt(np.linalg.eigvalsh(t)[0]) / step
-    touched = (2 * np.sqrt((10 - 4 * SIGMA_H**2 / sigma**2) * np.diag(t)) + 1).prod()
+    small = 10 - 6 * SIGMA_H**2 / sigma**2
+    touched = (2 * np.sqrt(small * np.diag(t)) + 1).prod()
     few = touched <= elements.FEW_CELLS  # with cells of one texel
-    cut = 10 - 4 * SIGMA_H**2 / sigma**2 if few else 10 + 3.5 * max(np.log2(2.5 / sigma), 0)
+    cut = small if few else 10 + 3.5 * max(np.log2(2.5 / sigma), 0)
     w = np.exp(-0.5 * rho2) * np.clip((cut - rho2) / 2, 0, 1)
     w /= w.sum()
     mean = normal + np.einsum("nij,nj->ni", jacobian, s2 * d @ np.linalg.inv(t))
@@ -205,7 +207,7 @@ def test_footprint_larger_than_the_map(variant):
 def test_lists_leave_out_little(variant, monkeypatch):
     """All cells against the lists, for the same cut: at most what NORMAL_REACH says."""
     pndf = Elements(MAP, 0.01, 0.5)
-    monkeypatch.setattr(elements, "cut_of_sums", elements.cut_of_lists)
+    monkeypatch.setattr(elements, "cut_of_sums", lambda sigma, _: elements.cut_of_lists(sigma))
     seen = footprint(1.5)
     m = draw(pndf, seen, 3000)
     densities = {}
@@ -247,6 +249,18 @@ def test_poisson_disk(count):
     distance = np.linalg.norm(difference, axis=-1) + 100 * np.eye(count)
     assert distance.min() >= np.sqrt(2) - 1e-5
     assert np.isclose(balanced_areas(places).sum(), n * n, rtol=1e-5)
+
+
+def test_no_gap_between_flakes_is_out_of_reach():
+    count = 20_000
+    places = poisson_disk(count, np.random.default_rng(3))
+    n = cells_for(count)
+    row, column = np.nonzero(~np.isnan(places[..., 0]))
+    position = (places[row, column] + np.stack([column, row], 1)) % n
+    tree = scipy.spatial.cKDTree(position, boxsize=n)
+    distance, _ = tree.query(np.random.default_rng(4).random((200_000, 2)) * n)
+    reach = np.sqrt(Flakes.point_cut) * SIGMA_H * n / np.sqrt(count)
+    assert distance.max() < 0.8 * reach  # measured: 0.57
 
 
 def test_balanced_flakes_cover_evenly(variant):

@@ -49,8 +49,8 @@ MAX_SEEDS = 4
 #: takes half of its 1120 MB then at a step of half a texel, and a quarter of that at one texel.
 BYTES_PER_CELL = 42, 90
 
-#: Attempts of the sampler, of which nine in ten succeed.
-MAX_ATTEMPTS = 64
+#: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
+MAX_ATTEMPTS = 128
 
 
 #: Elements fade in ρ², the squared Mahalanobis distance from the footprint's centre in N(0, T),
@@ -58,14 +58,14 @@ MAX_ATTEMPTS = 64
 FADE = 2.0
 
 
-def cut_of_sums(sigma: mi.Float) -> mi.Float:
+def cut_of_sums(sigma: mi.Float, point_cut: float) -> mi.Float:
     """ρ² of the cut where all elements are summed, and with them W: any cut keeps ∫D = 1.
 
     ``sigma`` is the minor standard deviation of T, in steps. A large footprint is cut as that of
-    other kernels, half of the fade within 3 standard deviations, half beyond. Where it is a point,
-    the elements around it are interpolated, and the nearest are the best.
+    other kernels, half of the fade within 3 standard deviations, half beyond; a point at
+    ``point_cut``.
     """
-    return 10 - 4 * SIGMA_H**2 / dr.square(sigma)
+    return 10 + (point_cut - 10) * SIGMA_H**2 / dr.square(sigma)
 
 
 def cut_of_lists(sigma: mi.Float) -> mi.Float:
@@ -138,6 +138,10 @@ class Mixture:
     and implements the methods that raise ``NotImplementedError`` here.
     """
 
+    #: ρ² of the cut where the footprint is a point: its elements are interpolated there, and the
+    #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
+    point_cut = 4.0
+
     #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
     origin = (0.0, 0.0)
 
@@ -183,7 +187,7 @@ class Mixture:
         kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
         kernel.mean = kernel.mean - mi.Vector2f(*self.origin)
         steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
-        cut = cut_of_sums(steps)
+        cut = cut_of_sums(steps, self.point_cut)
         kernel.cut_at(dr.sqrt(cut))
         few = self.is_small(kernel, steps)
         cut = dr.select(few, cut, cut_of_lists(steps))

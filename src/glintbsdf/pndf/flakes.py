@@ -75,6 +75,7 @@ class Flakes(Mixture):
 
     wrap_mode = "repeat"
     origin = (-0.5, -0.5)  # cells begin at the border of the square
+    point_cut = 16.0  # reaches 1.7 mean distances, across any gap
 
     def __init__(
         self,
