@@ -15,7 +15,9 @@ indirect light; that is printed too, with the part of it that noise makes up.
 
 Expected before measuring: separate costs 1.3 times where glints are cheap (two evaluations at the
 first bounce, one ray more), and less than off where wide footprints are dear; its indirect light
-has half of the error; denoising leaves a quarter of that.
+has half of the error; denoising leaves a quarter of that. Measured, ``--size 90 --reference 24``:
+0.46 and 0.76 times the time; no less error, for it is that of light which diffuse walls gather from
+the balls; denoising halves the error of indirect light.
 """
 
 from __future__ import annotations
