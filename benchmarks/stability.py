@@ -526,7 +526,7 @@ table { border-collapse: collapse } th, td { padding: .2em .7em; text-align: lef
 th { border-bottom: 2px solid #222; position: sticky; top: 0; background: #fff }
 tr:nth-child(even) { background: #f4f4f4 } td { font-variant-numeric: tabular-nums }
 td.broken { background: #c62828; color: #fff } .bound { font-weight: normal; color: #666 }
-pre { white-space: pre-wrap; max-width: 60em }
+pre { white-space: pre-wrap }
 """
 
 
