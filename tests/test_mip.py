@@ -162,6 +162,27 @@ def test_clamped_footprints_stay_inside(variant):
     assert relative_l1(outside, density(mip, round_footprint(mip, (1.0, 0.0), 3.0), normals)) < 1e-5
 
 
+@pytest.mark.parametrize(
+    ("sample", "sizes"),
+    [
+        ((4, 9), {"output_size": 50, "patch_size": 3, "overlap": 1, "clusters": 2}),
+        ((40, 70), {"output_size": 91, "patch_size": 39, "overlap": 5, "clusters": 1}),
+        ((64, 64), {"output_size": 65, "patch_size": 63, "clusters": 1024}),
+    ],
+)
+def test_odd_sizes_are_normalised(variant, sample, sizes):
+    mip, normals = make(maps.isotropic(sample, alpha=0.1, seed=1), sigma_r=0.04, **sizes), grid()
+    size = mip.synthesis.size
+    for sigma in (0.0, 0.5, 3.0, 20.0, 100 * size):
+        footprint = Footprint(
+            mi.Point2f(0.97, 0.41), mi.Vector2f(sigma / size, 0.3 * sigma / size), mi.Vector2f(0, 0)
+        )
+        values = density(mip, footprint, normals)
+        assert np.isfinite(values).all() and (values >= 0).all()
+        # Points 0.6 σ_r apart integrate Gaussians of σ_r exactly
+        assert abs(values.sum() * (1.2 / (RES - 1)) ** 2 - 1) < 1e-3
+
+
 # --------------------------------------------------------------------------------------------------
 #  The table on the device, memory
 # --------------------------------------------------------------------------------------------------

@@ -226,9 +226,11 @@ def build(
         "overlaps": overlaps.packed(step),
         "segments": segments,
         "normals": np.array(
-            [normal_bounds(texels)]
-            + [normal_bounds(inside, overlaps)] * len(layout.divisions)
-            + [normal_bounds(level) for level in levels]
+            [
+                normal_bounds(texels),
+                *(normal_bounds(inside, overlaps) for _ in layout.divisions),
+                *(normal_bounds(level) for level in levels),
+            ]
         ),
         "cells": np.concatenate([level.packed(step * 2**j) for j, level in enumerate(levels)]),
     }
