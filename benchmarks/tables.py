@@ -136,11 +136,13 @@ def main() -> None:
         pndf = TabulatedManifold(normal_map, options.kernel, max_error=options.max_error)
         built, worked = time.perf_counter() - start[0] - lists, time.process_time() - start[1]
         tables = pndf.tables
+        sizes = ", ".join(f"{n / 2**20:.1f}" for n in tables.level_nbytes)
+        grains = ", ".join(f"{g:.0f}" for g in tables.grains)
         print(
             f"{name}: lists {exact.nbytes / 2**20:.1f} MiB, {lists:.1f} s; with tables "
-            f"{pndf.nbytes / 2**20:.1f} MiB, {built:.1f} s (both: {worked:.1f} s of processors); "
-            f"levels {', '.join(f'{n / 2**20:.1f}' for n in tables.level_nbytes)} MiB, nodes from "
-            f"{tables.spacing(0):.1f} texels on; grain {tables.grain:.1f} texels",
+            f"{pndf.nbytes / 2**20:.1f} MiB, {built:.1f} s (both: {worked:.1f} s of processors)\n"
+            f"  nodes from {tables.spacing(0):.1f} texels on; levels of {sizes} MiB; "
+            f"grains of {grains} texels",
             flush=True,
         )
         for case in FOOTPRINTS:
@@ -163,7 +165,7 @@ def main() -> None:
                     "seconds_build": built,
                     "bytes": pndf.nbytes,
                     "bytes_levels": tables.level_nbytes,
-                    "grain": tables.grain,
+                    "grain": tables.grains[max(level, 0)],
                 }
             )
             if level < 0:

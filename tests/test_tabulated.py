@@ -184,9 +184,9 @@ def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
             narrowed = np.sqrt(1 - narrowing(spacing, kernel))
             smooth = splines[0] @ weights(nodes[0][:, None], nodes[1], narrowed) @ splines[1].T
             norms.append(np.abs(smooth / smooth.sum() - true).sum())
-        # The fit is to within 10 %; kernels with an edge differ by a third from place to place.
-        tolerance = 0.15 if kernel == "gaussian" else 0.35
-        assert np.isclose(np.mean(norms), kernel_error(kernel, spacing), rtol=tolerance)
+        share = np.mean(norms) / kernel_error(kernel, spacing)
+        # The fit is to within 12 %; with an edge, it has a margin, and places differ by a third.
+        assert (0.88 if kernel == "gaussian" else 0.5) < share < 1.12
 
 
 @pytest.mark.parametrize("name", ["isotropic", "brushed", "flakes", "leather"])
@@ -201,9 +201,8 @@ def test_predicted_error(variant, name):
         kernel = pndf.texel_kernel(view)
         predicted = pndf.error(kernel, level).numpy().item()
         assert predicted <= 0.05 < pndf.error(kernel, level + 1).numpy().item()
-        print(
-            name, sigma, level, predicted, pndf.measured_error(view) / predicted, pndf.tables.grain
-        )
+        ratio = pndf.measured_error(view) / predicted
+        assert 0.6 < ratio < 1.2  # 0.72 to 1.04 was measured
 
 
 def test_small_footprints_and_clamped_maps_are_exact(variant, normal_map, pndf):

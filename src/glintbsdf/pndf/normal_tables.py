@@ -287,22 +287,22 @@ class NormalTables:
         number of entries of the bin in tiles before (16 bits);
         ``starts`` (L, F): first entry of a bin;
         ``entries``: M_k(bin) per texel² as half floats times 2¹⁵, over the area of a node;
-        ``grain``: see :func:`grain`.
+        ``grains`` (L): see :func:`grains`.
 
     Attributes:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
-        grain (float): texels.
+        grains (list of float): texels, of every level.
         level_nbytes (list of int): memory of every level, bytes.
     """
 
     EMPTY = 0xFFFFFFFF
-    VERSION = 2
+    VERSION = 3
 
     def __init__(self, arrays: dict[str, np.ndarray], periods: tuple[int, int]) -> None:
         self.bins, self.periods = Bins(arrays["bounds"]), periods
         self.counts = [tuple(int(n) for n in count) for count in arrays["counts"]]
-        self.grain = float(arrays["grain"])
+        self.grains = [float(g) for g in arrays["grains"]]
         self.rows = mi.UInt32(arrays["rows"])
         filled = int((arrays["rows"] != self.EMPTY).sum())
         tiles = [filled * y * x for y, x in map(tiles_of, self.counts)]
@@ -398,7 +398,7 @@ class NormalTables:
             "words": np.concatenate(words),
             "starts": (np.stack(starts) + first[:, None]).astype(np.uint32),
             "entries": np.concatenate(entries),
-            "grain": np.array(grain(periods, counts, levels, spread)),
+            "grains": np.array(grains(periods, counts, levels, spread)),
         }
 
 
@@ -513,72 +513,84 @@ VARIANCE = {
 def kernel_error(kernel: str, x):
     """L1 norm of the difference of a kernel and its interpolation by splines.
 
-    ``x``: spacing of the nodes over the kernel's standard deviation. Fitted to within 10 % to the
-    norms, averaged over the nodes' places, of ``benchmarks/tables.py``.
+    ``x``: spacing of the nodes over the kernel's standard deviation. Fitted to the norms, averaged
+    over the nodes' places. A kernel with an edge is known there to a fraction of the spacing only,
+    and a quarter is added: the errors along an edge average out less than others.
     """
     if kernel == "gaussian":
-        return x * (0.016 + x * x * (0.012 + 0.007 * (x * x) * (x * x)))
-    return 0.6 * x  # at its edge it is known to a fraction of the spacing only
+        return x * (0.016 + x * x * (0.012 + 0.008 * (x * x) * (x * x)))
+    return 0.75 * x
 
 
-def grain(periods, counts, levels, spread) -> float:
-    """How far apart the independent places of a map are, texels.
+def grains(periods, counts, levels, spread) -> list[float]:
+    """How far apart the independent places of a map are, texels, at the scale of every level.
 
     Under a footprint of standard deviations σ₁, σ₂, the normals in a bin come from many places,
     whose errors average out: that of the P-NDF is, for rough maps of all kinds,
 
-        kernel_error · g / (g + √(σ₁ σ₂))
+        kernel_error · g / (g + √(σ₁ σ₂)).
 
-    g is taken from the errors themselves, under a few footprints.
+    g is taken from the errors themselves under a few footprints: those of the finest level against
+    the map, those of the others against the next finer one, which errs a tenth as much.
     """
     rng = np.random.default_rng(0)
-    found = [0.0]
-    for level, places in ((0, 6), (2, 2)):
-        if level >= len(levels) or min(counts[level]) == 1:
-            break
-        spacing = [p / n for p, n in zip(periods, counts[level], strict=True)]
+    found = []
+    for level, count in enumerate(counts):
+        if level > 0 and min(count) < 4:  # footprints as large as the map
+            found.append(found[-1])
+            continue
+        spacing = [p / n for p, n in zip(periods, count, strict=True)]
         sigma = max(spacing) / CALIBRATED
-        shrunk = []
-        for _ in range(places):
-            mean = rng.random(2) * periods
-            error = measured_error(mean, sigma, spacing, counts[level], levels[level], spread)
-            shrunk.append(error / kernel_error("gaussian", CALIBRATED))
-        share = min(np.mean(shrunk), 0.99)
+        errors = []
+        for mean in rng.random((6, 2)) * periods:
+            table = density_at(mean, sigma, periods, count, levels[level])
+            if level == 0:
+                truth = true_density(mean, sigma, spread)
+            else:
+                truth = density_at(mean, sigma, periods, counts[level - 1], levels[level - 1])
+            errors.append(np.abs(table - truth).sum())
+        share = min(np.mean(errors) / kernel_error("gaussian", CALIBRATED), 0.99)
         found.append(sigma * share / (1 - share))
-    return max(found)
+    return found
 
 
-#: Spacing of the nodes over the standard deviation of the footprints of :func:`grain`.
+#: Spacing of the nodes over the standard deviation of the footprints of :func:`grains`.
 CALIBRATED = 1.3
 
 
-def measured_error(mean, sigma: float, spacing, count, mass: csr_matrix, spread) -> float:
-    """Relative L1 error, over all bins, under a round Gaussian footprint at ``mean`` (y, x)."""
+def lattice_weights(mean, sigma, spacing, variance):
+    """A round Gaussian, cut at 3σ, on a lattice: its points (y, x), and its weights, of sum 1.
 
-    def weights(ranges, scale, variance):
-        """Those of a cut Gaussian of this variance, at the centres of the cells of a lattice."""
-        y, x = ((r + 0.5) * s - m for r, s, m in zip(ranges, scale, mean, strict=True))
-        distance = (y * y / variance[0])[:, None] + x * x / variance[1]
-        weight = np.where(distance <= 9, np.exp(-0.5 * distance), 0)
-        return (weight / weight.sum()).astype(np.float32)
+    The points lie at the centres of cells of ``spacing`` (y, x); ``variance`` (y, x) of the
+    Gaussian, which ``sigma`` bounds.
+    """
+    axes = [
+        np.arange(int((m - 3 * sigma) // s), int((m + 3 * sigma) // s) + 1)
+        for m, s in zip(mean, spacing, strict=True)
+    ]
+    y, x = (
+        ((points + 0.5) * s - m) ** 2 / v
+        for points, s, m, v in zip(axes, spacing, mean, variance, strict=True)
+    )
+    distance = y[:, None] + x
+    weight = np.where(distance <= 9, np.exp(-0.5 * distance), 0).ravel()
+    used = weight > 0
+    y, x = (v.ravel()[used] for v in np.meshgrid(*axes, indexing="ij"))
+    return y, x, (weight[used] / weight.sum()).astype(np.float32)
 
-    def around(scale):
-        return [
-            np.arange(int((m - 3 * sigma) // s), int((m + 3 * sigma) // s) + 1)
-            for m, s in zip(mean, scale, strict=True)
-        ]
 
-    quads = around((1, 1))
-    weight = weights(quads, (1, 1), (sigma**2, sigma**2))
-    touched = weight > 0
-    row, column = (v[touched] for v in np.meshgrid(*quads, indexing="ij"))
-    truth = spread(row, column).T @ weight[touched]
+def true_density(mean, sigma: float, spread) -> np.ndarray:
+    """Mass in every bin under a round Gaussian footprint at ``mean`` (y, x), texels."""
+    y, x, weight = lattice_weights(mean, sigma, (1, 1), (sigma**2, sigma**2))
+    return spread(y, x).T @ weight
 
-    nodes = around(spacing)
-    weight = weights(nodes, spacing, [sigma**2 - narrowing(s) for s in spacing])
-    y, x = (v.ravel() for v in np.meshgrid(*nodes, indexing="ij"))
-    table = mass[(y % count[0]) * count[1] + x % count[1]].T @ weight.ravel()
-    return float(np.abs(table / np.prod(spacing) - truth).sum())
+
+def density_at(mean, sigma: float, periods, count, mass: csr_matrix) -> np.ndarray:
+    """The same from the masses under the splines of a level."""
+    spacing = [p / n for p, n in zip(periods, count, strict=True)]
+    variance = [sigma**2 - narrowing(s) for s in spacing]
+    y, x, weight = lattice_weights(mean, sigma, spacing, variance)
+    return mass[(y % count[0]) * count[1] + x % count[1]].T @ weight / np.prod(spacing)
 
 
 def narrowing(spacing: float, kernel: str = "gaussian") -> float:

@@ -16,7 +16,7 @@ footprint's covariance beforehand; what is left is the difference of two kernels
 and covariance. Its L1 norm bounds the relative L1 error of the P-NDF on bins as fine as the tables'
 or coarser, whatever the map. The error itself is smaller, the more so the more independent places
 of the map fall into a bin; how far apart these are is measured when the tables are built
-(:func:`~glintbsdf.pndf.normal_tables.grain`). A footprint uses the coarsest level whose error,
+(:func:`~glintbsdf.pndf.normal_tables.grains`). A footprint uses the coarsest level whose error,
 predicted from the two, is allowed.
 """
 
@@ -46,7 +46,7 @@ class TabulatedManifold(Manifold):
     Args:
         max_error (float): relative L1 error of the P-NDF allowed, > 0, on the bins of the tables:
             1/128 of the range of the map's normals. The error predicted stays below; the one
-            measured is 0.6 to 1.05 of it (``benchmarks/tables.py``). Footprints so small that it
+            measured is 0.7 to 1.2 of it (``benchmarks/tables.py``). Footprints so small that it
             would be larger are evaluated exactly.
         reach: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
@@ -99,7 +99,7 @@ class TabulatedManifold(Manifold):
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
         minor = dr.sqrt(kernel.minor_variance)
         mean = dr.sqrt(kernel.sigma_u_given_v * kernel.sigma_v)
-        spacing, grain = self.tables.spacing(level), self.tables.grain
+        spacing, grain = self.tables.spacing(level), self.tables.grains[level]
         # Half of it comes from either axis.
         across = kernel_error(self.kernel, spacing * dr.rcp(minor))
         along = kernel_error(self.kernel, spacing * minor * dr.rcp(mean * mean))
