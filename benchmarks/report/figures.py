@@ -83,6 +83,13 @@ def panels(count: int, width: float = 3.1, height: float = 2.7, most: int = 5):
     return figure, axes[:count]
 
 
+def legend_below(figure: Figure, handles: dict, panels: int) -> None:
+    """A legend of as many columns as fit under ``panels`` panels."""
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=min(8, 2 * panels)
+    )
+
+
 def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: str) -> Figure:
     """Error against ``cost`` for one map, one panel per footprint; hollow where only noise.
 
@@ -100,7 +107,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
         on_front = {point["method"] for point in front}
         axis.plot(
             [scale * p[cost] for p in front],
-            [p[metric] for p in front],
+            np.minimum.accumulate([p[metric] for p in front]),
             drawstyle="steps-post",
             color="#c8c8c8",
             linewidth=3,
@@ -139,7 +146,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
         family: Line2D([], [], linestyle="", marker=palette.marker[family], color=mark.get_color())
         for family, mark in seen.items()
     }
-    figure.legend(solid.values(), solid.keys(), loc="outside lower center", ncols=len(solid))
+    legend_below(figure, solid, len(axes))
     return figure
 
 
@@ -165,7 +172,7 @@ def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> F
         logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel("radius r of the footprint (texels)")
     axes[0].set_ylabel("time per query (µs)")
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(lines))
+    legend_below(figure, lines, min(len(axes), 3))
     return figure
 
 
