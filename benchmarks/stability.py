@@ -156,7 +156,7 @@ METHODS: dict[str, Method] = {
     ),
     "manifold, no masking": Method("glint_manifold", {"masking": "none"}, VERTICAL),
     "manifold, threshold": Method(
-        "glint_manifold", {"threshold": 1e-2}, sweep=("threshold", decades(-6, 2)), large=True
+        "glint_manifold", {"threshold": 1e-2}, sweep=("threshold", decades(-6, 2))
     ),
     "manifold, max_error": Method(
         "glint_manifold", {"max_error": 0.1}, sweep=("max_error", decades(-6, 2)), large=True
