@@ -44,7 +44,7 @@ def test_direct_light_stays_bit_for_bit(variant, monkeypatch):
 
 @needs_denoiser
 def test_error_of_indirect_light_falls(variant, monkeypatch):
-    """Against a reference of 64 times as many samples; the mean is kept."""
+    """Against a reference of 32 times as many samples; the mean is kept."""
     noisy = []
     original = denoising.denoise
 
@@ -55,12 +55,12 @@ def test_error_of_indirect_light_falls(variant, monkeypatch):
     monkeypatch.setattr(denoising, "denoise", spy)
     rendering.render(glinting_room(), spp=16, seed=1, denoise=True)
     before, after = noisy[0]
-    _, _, reference = parts(glinting_room(), spp=1024, seed=2, max_depth=6)
+    _, _, reference = parts(glinting_room(), spp=512, seed=2, max_depth=6)
 
     def error(image):
         return np.sqrt(np.mean((image - reference) ** 2))
 
-    # Measured: 0.0571 and 0.0097, means 0.0672, 0.0661 and 0.0664
+    # Measured: 0.0577 and 0.0122, means 0.0672, 0.0661 and 0.0664
     assert error(after) < 0.3 * error(before)
     assert abs(after.mean() / before.mean() - 1) < 0.03
     assert abs(after.mean() / reference.mean() - 1) < 0.02

@@ -64,18 +64,18 @@ def test_strategies_of_the_textured_light(variant):
     def images(bsdf_samples: int, emitter_samples: int, spp: int, seeds: range) -> np.ndarray:
         scene = load(
             SCENES / "textured_light.xml",
-            **{**IMAGE, "spp": spp, "uv_scale": 1, "pixel_spread": 0.002},
+            **{"resx": 60, "resy": 40, "spp": spp, "uv_scale": 1, "pixel_spread": 0.002},
             bsdf_samples=bsdf_samples,
             emitter_samples=emitter_samples,
         )
         return np.array([np.array(mi.render(scene, seed=seed)).mean(axis=2) for seed in seeds])
 
-    reference = images(1, 1, 128, range(9, 10))
+    reference = images(1, 1, 512, range(9, 10))
     assert np.isfinite(reference).all() and reference.mean() > 0.1
     errors = {}
     for strategy in ((1, 0), (0, 1), (1, 1)):
-        estimates = images(*strategy, 16, range(3))
+        estimates = images(*strategy, 16, range(4))
         # Logarithms, so that a few bright pixels do not decide alone.
         errors[strategy] = np.abs(np.log(estimates + 0.01) - np.log(reference + 0.01)).mean()
-    # Measured: 0.143 (BSDF), 1.55 (light), 0.123 (both)
+    # Measured: 0.164 (BSDF), 1.59 (light), 0.150 (both)
     assert errors[1, 1] < 0.95 * min(errors[1, 0], errors[0, 1])
