@@ -20,7 +20,7 @@ from sphinx.util.nodes import nested_parse_with_titles
 PLUGINS = Path(__file__).parents[2] / "plugins"
 
 TITLES = ("Parameter", "Type", "Description", "Flags")
-WIDTHS = (16, 12, 62, 10)  # per cent
+WIDTHS = (21, 14, 55, 10)  # per cent
 
 
 class Plugin(SphinxDirective):
