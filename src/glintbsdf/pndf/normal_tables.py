@@ -515,11 +515,11 @@ def kernel_error(kernel: str, x):
 
     ``x``: spacing of the nodes over the kernel's standard deviation. Fitted to the norms, averaged
     over the nodes' places. A kernel with an edge is known there to a fraction of the spacing only,
-    and a quarter is added: the errors along an edge average out less than others.
+    and half as much is added: the errors along an edge average out less than others.
     """
     if kernel == "gaussian":
         return x * (0.016 + x * x * (0.012 + 0.008 * (x * x) * (x * x)))
-    return 0.75 * x
+    return 0.9 * x
 
 
 def grains(periods, counts, levels, spread) -> list[float]:

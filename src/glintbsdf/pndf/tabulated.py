@@ -46,8 +46,8 @@ class TabulatedManifold(Manifold):
     Args:
         max_error (float): relative L1 error of the P-NDF allowed, > 0, on the bins of the tables:
             1/128 of the range of the map's normals. The error predicted stays below; the one
-            measured is 0.7 to 1.2 of it (``benchmarks/tables.py``). Footprints so small that it
-            would be larger are evaluated exactly.
+            measured is 0.7 to 1.2 of it (``benchmarks/tables.py``), and up to 1.5 for kernels with
+            an edge. Footprints so small that it would be larger are evaluated exactly.
         reach: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
     A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. The tables carry derivatives
