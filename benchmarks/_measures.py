@@ -173,7 +173,9 @@ def cut_of(box: Array, points: Array) -> tuple[int, float] | None:
     widest = int(np.argmax(gaps))
     if gaps[widest] < 0.25 * (high[axis] - low[axis]):
         widest = len(ordered) // 2
-    return axis, 0.5 * (ordered[widest] + ordered[widest + 1])
+    place = 0.5 * (ordered[widest] + ordered[widest + 1])
+    # Half of the points may be one and the same, as float32 normals of a narrow lobe are.
+    return axis, place if place > low[axis] else 0.5 * (low[axis] + high[axis])
 
 
 def count_in(cells: Array, points: Array) -> Array:

@@ -162,6 +162,15 @@ class Stated:
         return getattr(self.bsdf, name)
 
 
+def test_cells_around_points_that_coincide(measures):
+    # As of a lobe that is hardly wider than the spacing of float32.
+    points = np.full((300, 2), 0.6)
+    points[200:] += np.linspace(0, 1e-4, 100)[:, None]
+    cells, cell_of = measures.partition(points)
+    assert np.isclose(np.prod(cells[:, 1] - cells[:, 0], axis=1).sum(), 4)
+    assert len(np.unique(cell_of)) > 3
+
+
 def test_false_densities_are_found(measures):
     def rough(alpha):
         return mi.load_dict({"type": "roughconductor", "alpha": alpha, "distribution": "beckmann"})
