@@ -35,12 +35,8 @@ SMALLEST_GRID = 12
 #: Iterations of k-means.
 ITERATIONS = 8
 
-#: Standard deviations of a lobe's normals that count at most: those that a footprint sees may lie
-#: :data:`~glintbsdf.pndf.packed_lobes.CUT` of them off its mean, and vary about that.
-SPREADS = packed_lobes.CUT + packed_lobes.NORMAL_CUT
-
 #: Of what :func:`build` returns; part of the cache's key.
-VERSION = 3
+VERSION = 4
 
 
 @dataclass
@@ -203,7 +199,7 @@ def build(
         overlaps; ``segments``, (n² + 1) per cell: where in them each grid of the finest division
         begins, in Morton order; ``cells``: those of cells and groups of cells, level by level;
         ``normals``, per level: the rectangle (lower, upper) of the lobes' normals, to
-        :data:`SPREADS` standard deviations.
+        :data:`~glintbsdf.pndf.packed_lobes.NORMAL_CUT` standard deviations.
         Unless there are divisions, ``inside``, ``overlaps`` and ``segments`` are empty.
     """
     layout = Layout.of(synthesis)
@@ -240,7 +236,7 @@ def normal_bounds(*parts: Lobes) -> np.ndarray:
     """Lower and upper corner of a rectangle that holds the normals of lobes, 2×2."""
     lobes = Lobes.concatenate(list(parts))
     lobes = lobes[lobes.mass > 0]
-    reach = SPREADS * np.sqrt(np.einsum("ijj->ij", lobes.covariance)[:, 2:])
+    reach = packed_lobes.NORMAL_CUT * np.sqrt(np.einsum("ijj->ij", lobes.covariance)[:, 2:])
     mean = lobes.mean[:, 2:]
     return np.stack(((mean - reach).min(axis=0), (mean + reach).max(axis=0)))
 

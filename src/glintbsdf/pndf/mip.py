@@ -309,16 +309,13 @@ class Mip:
 
         def add(state, lobe, d, sign, active):
             density, mass = state
-            weight, distance = lobe.weight(d)
+            weight = lobe.weight(d)
 
             def contribution():
                 return weight * lobe.normals(d).eval(m, variance)
 
-            # The mean moves with the footprint by less than the spread times √distance.
-            far = lobe.spread * dr.sqrt(distance) + NORMAL_CUT * dr.sqrt(
-                dr.fma(lobe.spread, lobe.spread, variance)
-            )
-            near = (weight > 0) & (dr.squared_norm(m - lobe.mean_normal()) < dr.square(far))
+            reach = NORMAL_CUT**2 * dr.fma(lobe.spread, lobe.spread, variance)
+            near = (weight > 0) & (dr.squared_norm(m - lobe.mean_normal()) < reach)
             return add_where(density, near, contribution, active), mass + weight
 
         state = mi.Float(0), mi.Float(0)
@@ -341,7 +338,7 @@ class Mip:
 
         def add(state, lobe, d, sign, active):
             mass, turn, index, place, side = state
-            weight, _ = lobe.weight(d)
+            weight = lobe.weight(d)
             mass = mass + weight
             chosen = uniform(pcg3d(turn, name, 0)[0]) * mass < weight
             return (

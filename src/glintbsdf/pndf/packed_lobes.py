@@ -29,8 +29,9 @@ from ..gaussian_lobes import Gaussian
 #: of the mass.
 CUT = 3.5
 
-#: Standard deviations beyond which normals of a lobe are left out: 4e-5 of its mass at most.
-NORMAL_CUT = 4.5
+#: Standard deviations of a lobe's normals beyond which they are left out. Those that a footprint
+#: sees at the lobe's rim may have their mean 3.5 of them off: some 1e-5 of the mass is lost there.
+NORMAL_CUT = 5.5
 
 #: Version of the format, part of the keys of caches.
 VERSION = 1
@@ -127,13 +128,13 @@ class Lobe:
         """L⁻¹ v."""
         return mi.Vector2f(self.xx * v.x, dr.fma(self.yx, v.x, self.yy * v.y))
 
-    def weight(self, d: mi.Vector2f) -> tuple[mi.Float, mi.Float]:
+    def weight(self, d: mi.Vector2f) -> mi.Float:
         """The lobe's mass under a footprint with the centre ``d``, but for a factor common to all
-        lobes of a level, and the squared distance dᵀ T⁻¹ d; 0 beyond :data:`CUT`."""
+        lobes of a level; 0 beyond :data:`CUT`."""
         distance = scaled_distance(self.vectors, self.scaled(d), self.root)
         density = self.xx * self.yy * self.root * dr.exp(-0.5 * distance)
         seen = self.active & (distance < CUT**2)
-        return dr.select(seen, self.mass * density, 0), distance
+        return dr.select(seen, self.mass * density, 0)
 
     def mean_normal(self) -> mi.Vector2f:
         """s, the mean normal, wherever the footprint."""
