@@ -154,9 +154,9 @@ patches that fit in two overlapping texels are rare: see :monosp:`overlap`.
 Where lobes are clustered, their details are lost: for footprints 16, 32, 64 and 128 texels wide the
 P-NDF differs from that of :ref:`glint_elements <bsdf-glint_elements>` on the same map by 21, 18, 12
 and 9 % (relative L1) on a map of Gaussian bumps, and by 7 to 9 % on one of scratches. Narrower
-footprints see the lobes of texels, which differ by 4 to 8 %. At 64 texels a query takes a twentieth of
-the time that the elements take, at 16 about as long; where a pixel covers fewer, and where most of
-the surface reflects nothing, the elements are faster.
+footprints see the lobes of texels, which differ by 4 to 8 %. At 64 texels a query takes a twentieth
+of the time that the elements take, at 16 about as long; where a pixel covers fewer, and where most
+of the surface reflects nothing, the elements are faster.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
