@@ -2,8 +2,8 @@
 
 The integrator :mod:`glint_path <glintbsdf.plugins.glint_path>` separates the two. Indirect light is
 smooth but noisy (Tan et al. 2022, section 4), and Intel Open Image Denoise, through the package
-``mitsuba-oidn``, filters it with the albedo and the normals of the visible surfaces as guides, which
-Mitsuba's integrator ``aov`` renders along with the image.
+``mitsuba-oidn``, filters it. Its guides are the albedo and the normals of the visible surfaces,
+which Mitsuba's integrator ``aov`` renders along with the image.
 """
 
 from __future__ import annotations
