@@ -16,9 +16,8 @@ on the smooth one; tables save 10 to 40 times at an error of 0.05.
 
 Measured at 128² texels: clusters 2.9 times at 0.22 on the isotropic map, 2.8 times at 0.13 on the
 scratched one, none up to τ = 1 on the brushed one; tables 20, 37 and 8 times at 0.006 to 0.026. Our
-residuals are integrals in texels⁴, the
-paper's those of its normal equations: its τ is another number. With its own residuals and
-τ = 0.004, the authors' code errs by 0.26 to 0.73.
+residuals are integrals in texels⁴, the paper's those of its normal equations: its τ is another
+number. With its own residuals and τ = 0.004, the authors' code errs by 0.26 to 0.73.
 
 ``renders`` (Fig. 15, Table 3): the curved patch with scratches, 64² texels a footprint: root mean
 square error against the exact render of another seed, both clipped to [0, 1], relative to the mean,
