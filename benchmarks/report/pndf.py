@@ -23,7 +23,7 @@ from .methods import EXACT, SIGMA_R, Method, Surface
 #: Clamp of the Jacobian of those who have none: their own roughness hides it.
 UNCLAMPED = 1e-6
 
-#: Queries of the first call, which compiles, and of the one that says how long a batch shall be.
+#: Queries of a call that takes little more than to be traced.
 FEW = 256
 
 #: Most queries of a batch.
@@ -273,19 +273,26 @@ def times(structures: dict[Method, object], surface: Surface, radius: float, set
     """Median seconds per query of every method, and how many times faster than exact it is.
 
     One thread. All methods in turn within every repetition, after a warm-up that compiles and says
-    how many queries make a batch.
+    how many queries make a batch. The time of a call with few queries, which is that of tracing, is
+    taken off.
     """
     many = queries(surface, radius, MOST)
+    few = first(FEW, *many)
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
         works, counts = [], []
         for pndf in structures.values():
-            few = first(FEW, *many)
-            taken = min(seconds(pndf.eval, *few) for _ in range(2))
-            counts.append(int(np.clip(FEW * settings.batch / taken, FEW, MOST)) // 8 * 8)
+            traced, more = (
+                min(seconds(pndf.eval, *first(count, *many)) for _ in range(3))
+                for count in (FEW, 16 * FEW)
+            )
+            marginal = max((more - traced) / (15 * FEW), settings.batch / MOST)
+            counts.append(int(np.clip(settings.batch / marginal, 2 * FEW, MOST)) // 8 * 8)
+            works.append(partial(batch, pndf, *few))
             works.append(partial(batch, pndf, *first(counts[-1], *many)))
-        taken = seconds_in_turn(works, settings.repetitions) / counts
+        taken = seconds_in_turn(works, settings.repetitions)
+        taken = np.maximum(taken[:, 1::2] - taken[:, ::2], 0) / (np.array(counts) - FEW)
     finally:
         dr.set_thread_count(threads)
     per_query = np.median(taken, axis=0)
