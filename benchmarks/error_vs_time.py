@@ -88,7 +88,7 @@ QUICK = Settings(
         maps=("isotropic patches",),
         scales=(2.0,),
         size=64,
-        truth_spp=16384,
+        truth_spp=8192,
         budgets=(1, 4, 16, 64, 256),
         seeds=3,
     ),
