@@ -6,30 +6,7 @@ Diffuse facets of a normal map (:monosp:`glint_diffuse`)
 
 .. pluginparameters::
 
- * - filename
-   - |string|
-   - Image file of the normal or height map: OpenEXR, PNG, TIFF and what else Mitsuba reads. A
-     relative name counts from the scene's folder.
-
- * - bitmap
-   - :monosp:`mitsuba.Bitmap`
-   - The map itself, instead of :monosp:`filename`, when the scene is built in Python.
-
- * - data
-   - |tensor|
-   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
-     the map in use: the projected normals, H×W×2.
-   - |exposed|, |differentiable|
-
- * - map_type, height_scale, wrap_mode
-   - |string|, |float|, |string|
-   - What the map holds and what lies beyond its border, as for
-     :ref:`glint_manifold <bsdf-glint_manifold>`. (Default: :monosp:`auto`, 1, :monosp:`repeat`)
-
- * - to_uv
-   - |transform|
-   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
-   - |exposed|
+ * Shared: filename, bitmap, data, map_type, height_scale, wrap_mode, to_uv
 
  * - reflectance
    - |spectrum| or |texture|
@@ -42,17 +19,7 @@ Diffuse facets of a normal map (:monosp:`glint_diffuse`)
      :monosp:`oren_nayar`: Oren and Nayar's model, as rough as the footprint's facets, around their
      mean normal. Faster, and blind to what is smaller than a pixel. (Default: :monosp:`manifold`)
 
- * - footprint_sigma
-   - |float|
-   - Standard deviation of the footprint, in pixels. (Default: 0.5)
-   - |exposed|, |differentiable|, |discontinuous|
-
- * - pixel_spread
-   - |float|
-   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
-     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
-     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
-   - |exposed|, |differentiable|, |discontinuous|
+ * Shared: footprint_sigma, pixel_spread
 
 A diffuse surface with a normal map, free of aliasing. The usual way, :monosp:`diffuse` inside
 :monosp:`normalmap`, looks at one normal of the pixel's footprint per sample. This material
@@ -105,6 +72,7 @@ import mitsuba as mi
 
 from glintbsdf.bsdf import FootprintBSDF
 from glintbsdf.diffuse import FacetDiffuse, OrenNayarDiffuse
+from glintbsdf.microfacet import above_horizon
 from glintbsdf.parameters import Parameters
 from glintbsdf.pndf.manifold import TexelMesh
 from glintbsdf.reach import Reach
@@ -180,10 +148,7 @@ class GlintDiffuse(FootprintBSDF):
     ) -> tuple[mi.Spectrum, mi.Float]:
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection):
             return mi.Spectrum(0), mi.Float(0)
-        active = mi.Bool(active) & (si.wi.z > 0) & (wo.z > 0)
-        # Lanes below the horizon must stay finite: their derivatives would be NaN.
-        up = mi.Vector3f(0, 0, 1)
-        wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
+        active, wi, wo = above_horizon(active, si.wi, wo)
         footprint = self.footprint(si, active)
         white = wo.z * (1 / pi)  # as long as it waits to be built
         if self.method is not None:

@@ -74,33 +74,7 @@ Procedural glints and grooves (:monosp:`glint_grid`)
      (Default: 0.5)
    - |exposed|
 
- * - pixel_spread
-   - |float|
-   - Angle of a pixel in radians, divided by the square root of the samples per pixel: the size of
-     the footprint in integrators that tell none, which are all but :monosp:`glint_path`.
-     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
-   - |exposed|
-
- * - material
-   - |string|
-   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
-
- * - eta, k
-   - |spectrum| or |texture|
-   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
-     (Default: 0 and 1 where only the other is given)
-   - |exposed|, |differentiable|, |discontinuous|
-
- * - int_ior, ext_ior
-   - |float| or |string|
-   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
-     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
-     :monosp:`bk7` and :monosp:`air` where only the other is given)
-
- * - specular_reflectance
-   - |spectrum| or |texture|
-   - Factor on the reflection, in [0, 1]. (Default: 1)
-   - |exposed|, |differentiable|
+ * Shared: pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
 Glitter, snow, sand and brushed metal from a few parameters: no map, no memory, no precomputation.
 Microdetails, each a small lobe of roughness :monosp:`detail_alpha`, are strewn over the surface and

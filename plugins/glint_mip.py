@@ -21,16 +21,7 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
      are its projected normals, H×W×2; new ones make everything anew.
    - |exposed|
 
- * - map_type
-   - |string|
-   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z) in [−1, 1]; :monosp:`height`, which
-     gives normals ∝ (−∂h/∂x, −∂h/∂y, 1); or :monosp:`auto`, a height where there is one channel or
-     all channels are equal. Files of unsigned integers are decoded from [0, 1].
-     (Default: :monosp:`auto`)
-
- * - height_scale
-   - |float|
-   - Texels per unit of height. (Default: 1)
+ * Shared: map_type, height_scale
 
  * - wrap_mode
    - |string|
@@ -95,38 +86,7 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
    - Masking and shadowing: :monosp:`beckmann`, that of a Beckmann surface as rough as the whole
      sample, or :monosp:`none`. (Default: :monosp:`beckmann`)
 
- * - footprint_sigma
-   - |float|
-   - Standard deviation of the footprint, in pixels. (Default: 0.5)
-   - |exposed|, |differentiable|, |discontinuous|
-
- * - pixel_spread
-   - |float|
-   - Angle of a pixel in radians, from which the footprint follows where the integrator gives none:
-     Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
-     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
-   - |exposed|, |differentiable|, |discontinuous|
-
- * - material
-   - |string|
-   - Name of a metal, as in :monosp:`roughconductor`. (Default: :monosp:`none`, a perfect mirror)
-
- * - eta, k
-   - |spectrum| or |texture|
-   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
-     (Default: 0 and 1 where only the other is given)
-   - |exposed|, |differentiable|, |discontinuous|
-
- * - int_ior, ext_ior
-   - |float| or |string|
-   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
-     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
-     :monosp:`bk7` and :monosp:`air` where only the other is given)
-
- * - specular_reflectance
-   - |spectrum| or |texture|
-   - Factor on the reflection, in [0, 1]. (Default: 1)
-   - |exposed|, |differentiable|
+ * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
 A large microstructure that is never stored: it is put together from patches of a small sample, as
 in :cite:`Tan2022`. Neighbouring patches are chosen to fit, and cut where they differ least; a

@@ -332,7 +332,7 @@ def scatter(
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic (Veach 1997, section 9.2.2) for a sample of ``pdf_a``; 0 if undefined."""
+    """Power heuristic (Veach 1997) for a sample of ``pdf_a``; 0 if undefined."""
     pdf_a, pdf_b = dr.square(pdf_a), dr.square(pdf_b)
     weight = pdf_a / (pdf_a + pdf_b)
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
