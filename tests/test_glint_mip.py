@@ -188,8 +188,8 @@ def footprint(seen: View) -> Footprint:
 
 
 def test_new_data_make_a_new_map(variant):
-    bsdf, params_of = load(), mi.traverse
-    params = params_of(bsdf)
+    bsdf = load()
+    params = mi.traverse(bsdf)
     before = suite.density(bsdf, VIEWS["grids and cells"], mi.Vector2f(0.1, 0.05))
     params["data"] = mi.TensorXf(maps.isotropic(64, alpha=0.1, seed=3).normals)
     params.update()

@@ -132,9 +132,9 @@ def test_fewer_lobes_than_clusters_are_kept_as_they_are():
 
 def test_grids_of_a_coarser_division_are_neighbours_in_morton_order():
     y, x = (v.ravel() for v in np.indices((4, 4)))
-    index = morton(y, x)
+    index = morton(y, x, 4)
     assert sorted(index) == list(range(16))
-    assert np.array_equal(index >> 2, morton(y >> 1, x >> 1))
+    assert np.array_equal(index >> 2, morton(y >> 1, x >> 1, 2))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -203,4 +203,4 @@ def test_inside_and_overlaps_make_up_a_cell(synthesis, levels, cell):
     # Segments hold what lies in their grids
     for k in range(n * n):
         place = unpacked(levels["overlaps"][segments[k] : segments[k + 1]], step).mean
-        assert (morton(*(layout.grid(place[:, a] + 1e-3, n) for a in (1, 0))) == k).all()
+        assert (morton(*(layout.grid(place[:, a] + 1e-3, n) for a in (1, 0)), n) == k).all()

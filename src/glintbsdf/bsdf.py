@@ -233,12 +233,9 @@ class GlintBSDF(FootprintBSDF):
         active: mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         bs = dr.zeros(mi.BSDFSample3f)
-        active = mi.Bool(active) & (mi.Frame3f.cos_theta(si.wi) > 0)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
             return bs, mi.Spectrum(0)
-
-        # Lanes below the horizon draw a harmless normal for the vertical: they stay numbers.
-        wi = dr.select(active, si.wi, mi.Vector3f(0, 0, 1))
+        active, wi = microfacet.above_horizon(active, si.wi)
 
         # Draw a normal and reflect about it. One that does not point up, or reflects below the
         # horizon, is an invalid sample: its mass is missing from the pdf as well.
@@ -268,18 +265,9 @@ class GlintBSDF(FootprintBSDF):
         wo: mi.Vector3f,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        cos_theta_i = mi.Frame3f.cos_theta(si.wi)
-        active = mi.Bool(active) & (cos_theta_i > 0) & (mi.Frame3f.cos_theta(wo) > 0)
         if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
             return mi.Spectrum(0), mi.Float(0)
-
-        # The bumpmap of Mitsuba 3.9 hands over NaN where its relief is level and dp_du the z axis.
-        active &= dr.isfinite(si.wi.x)
-
-        # Lanes below the horizon compute a harmless reflection along the normal: a NaN in a lane
-        # that is masked away would still reach its derivatives.
-        up = mi.Vector3f(0, 0, 1)
-        wi, wo = dr.select(active, si.wi, up), dr.select(active, wo, up)
+        active, wi, wo = microfacet.above_horizon(active, si.wi, wo)
         m = microfacet.half_vector(wi, wo)
         footprint = self.footprint(si, active)
         facets = self.facets(ctx)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 
 class ParameterError(ValueError):
     """A parameter of a plugin or function has a value that is not allowed."""
@@ -25,3 +27,11 @@ def check(condition: bool, owner: str, parameter: str, requirement: str, got: ob
 def check_choice(owner: str, parameter: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise :class:`ParameterError` unless ``value`` is one of ``choices``."""
     check(value in choices, owner, parameter, "one of " + ", ".join(choices), value)
+
+
+def check_whole(
+    value: object, fits: Callable[[int], bool], owner: str, parameter: str, requirement: str
+) -> None:
+    """Raise :class:`ParameterError` unless ``value`` is a whole number that ``fits``."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    check(whole and fits(value), owner, parameter, f"a whole number {requirement}", value)

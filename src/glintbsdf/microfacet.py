@@ -24,8 +24,21 @@ if TYPE_CHECKING:
     from .footprint import Footprint
 
 # --------------------------------------------------------------------------------------------------
-#  Half vectors
+#  Directions and half vectors
 # --------------------------------------------------------------------------------------------------
+
+
+def above_horizon(active: mi.Bool, *directions: mi.Vector3f) -> tuple:
+    """``(active, *directions)``, of the lanes alone in which all directions are above the horizon.
+
+    Elsewhere all of them become the vertical, for which everything is a number: a NaN in a lane
+    that is masked away would still reach its derivatives. The ``bumpmap`` of Mitsuba 3.9 hands over
+    NaN where its relief is level and dp_du the z axis; z need not be among them.
+    """
+    active = mi.Bool(active)
+    for direction in directions:
+        active &= (mi.Frame3f.cos_theta(direction) > 0) & dr.isfinite(direction.x)
+    return active, *(dr.select(active, d, mi.Vector3f(0, 0, 1)) for d in directions)
 
 
 def half_vector(wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Vector3f:

@@ -119,7 +119,7 @@ class RayCone:
 
         The two added directions are perpendicular, and of all such pairs the one nearest to
         (``dp_x``, ``dp_y``): a lobe makes the cone diverge, so widths add, as those of ray cones do
-        (Akenine-Möller et al. 2021, section 3).
+        (Akenine-Möller et al. 2021).
         """
         x, y = _nearest_orthonormal(d, self.dp_x, self.dp_y)
         return RayCone(self.dp_x, self.dp_y, self.dd_x + x * spread, self.dd_y + y * spread)

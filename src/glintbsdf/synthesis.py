@@ -12,7 +12,6 @@ overlaps, from whose patch they belong to. Arrays are indexed (row, column), in 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, sqrt
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import check
+from .errors import check, check_whole
 from .normalmap import NormalMap
 from .progress import progress
 
@@ -205,15 +204,6 @@ def overlap_index(y, x, step_x, overlap: int):
     """
     beside = np.where(x < overlap, overlap * step_x + (y - overlap) * overlap + x, -1)
     return np.where(y < overlap, y * step_x + x, beside)
-
-
-def check_whole(
-    value: object, fits: Callable[[int], bool], owner: str, parameter: str, requirement: str
-) -> None:
-    """Raise :class:`~glintbsdf.errors.ParameterError` unless ``value`` is a whole number that
-    ``fits``."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    check(whole and fits(value), owner, parameter, f"a whole number {requirement}", value)
 
 
 def check_sizes(

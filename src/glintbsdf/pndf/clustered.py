@@ -535,12 +535,8 @@ class ClusteredManifold(Manifold):
     def element_triangles(self, row, column, level, active):
         """The two effective triangles of an element, without derivatives."""
         with dr.suspend_grad():
-            n0, n1, n2, n3 = self.element_normals(row, column, level, active)
-            centre = 0.5 * (n1 + n2)
-            return (
-                effective_triangle(n0, n1, n2, centre, self.epsilon),
-                effective_triangle(n3, n2, n1, centre, self.epsilon),
-            )
+            normals = self.element_normals(row, column, level, active)
+            return triangles_of_quad(normals, self.epsilon)
 
     def rung(self, kernel):
         """The rung of the ladder for a kernel: the highest that its r_x r_y τ allows."""

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..cache import load_or_build
-from ..errors import ParameterError, check
+from ..errors import ParameterError, check, check_whole
 from ..gaussian_lobes import SIGMA_H, Gaussian
 from ..lattice import BLOCK, Lattice
 from ..poisson_disk import balanced_areas, cells_for, poisson_disk
@@ -88,8 +88,7 @@ class Flakes(Mixture):
         check_sigma_r(owner, sigma_r)
         check(1 <= density < inf, owner, "flake_density", "a finite number ≥ 1", density)
         check(0 <= alpha < inf, owner, "flake_alpha", "a finite number ≥ 0", alpha)
-        whole = isinstance(seed, int) and not isinstance(seed, bool)
-        check(whole and seed >= 0, owner, "seed", "an integer ≥ 0", seed)
+        check_whole(seed, lambda value: value >= 0, owner, "seed", "≥ 0")
         self.count, self.alpha, self.seed, self.owner = round(density), alpha, seed, owner
         check_memory(owner, self.count)
         self.sigma_r = mi.Float(sigma_r)

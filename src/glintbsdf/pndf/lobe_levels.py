@@ -149,10 +149,13 @@ class Clustering:
         return kmeans2(features, begin, iter=ITERATIONS, minit="matrix")[1]
 
 
-def morton(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Index of a grid in Morton order: those of a coarser division lie side by side."""
-    result = np.zeros_like(y)
-    for bit in range(int(max(y.max(initial=0), x.max(initial=0))).bit_length()):
+def morton(y, x, n: int):
+    """Index of a grid among n×n ones, n a power of two, in Morton order.
+
+    Those of a coarser division lie side by side. NumPy's or Dr.Jit's integers.
+    """
+    result = 0
+    for bit in range(n.bit_length() - 1):
         result |= ((y >> bit & 1) << (2 * bit + 1)) | ((x >> bit & 1) << (2 * bit))
     return result
 
@@ -290,14 +293,13 @@ def _cells(synthesis, layout, clustering, texels, finest):
     overlaps, segments, cells = [], [], []
     first = 0
     for y in range(count):
-        row = _cell_row(synthesis, layout, texels, y, whole=finest is None)
-        lobes, cell = row
-        if finest is None:
-            cells.append(clustering.gather(lobes, cell, count, layout.inner))
-            continue
+        lobes, cell = _cell_row(synthesis, layout, texels, y, whole=finest is None)
         lobes = clustering.gather(lobes, cell, count, layout.inner)
+        if finest is None:
+            cells.append(lobes)
+            continue
         cell = np.repeat(np.arange(count), clustering.clusters)
-        grid = morton(*(layout.grid(lobes.mean[:, axis], n) for axis in (1, 0)))
+        grid = morton(*(layout.grid(lobes.mean[:, axis], n) for axis in (1, 0)), n)
         # Lobes of no mass come last, behind all grids
         key = cell * (n * n + 1) + np.where(lobes.mass > 0, grid, n * n)
         order = np.argsort(key, kind="stable")

@@ -62,6 +62,16 @@ def effective_triangle(a, b, c, centre, epsilon):
     )
 
 
+def triangles_of_quad(normals, epsilon):
+    """The two effective triangles of a quad with the normals n0…n3."""
+    n0, n1, n2, n3 = normals
+    centre = 0.5 * (n1 + n2)
+    return (
+        effective_triangle(n0, n1, n2, centre, epsilon),
+        effective_triangle(n3, n2, n1, centre, epsilon),
+    )
+
+
 def normal_in_quad(l1, l2, normals, epsilon):
     """The normal n(u) of a quad's effective triangles at the place (``l1``, ``l2``) ∈ [0, 1]²."""
     return frame_in_quad(l1, l2, normals, epsilon)[0]
@@ -209,12 +219,7 @@ class TexelMesh:
     def effective_triangles(self, row, column, active=True):
         """The two effective triangles of a stored quad, without derivatives."""
         with dr.suspend_grad():
-            n0, n1, n2, n3 = self.quad_normals(row, column, active)
-            centre = 0.5 * (n1 + n2)
-            return (
-                effective_triangle(n0, n1, n2, centre, self.epsilon),
-                effective_triangle(n3, n2, n1, centre, self.epsilon),
-            )
+            return triangles_of_quad(self.quad_normals(row, column, active), self.epsilon)
 
     def normal_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> mi.Vector2f:
         """The projected normal n(u) of the effective triangles at the position ``u``, in texels."""

@@ -22,14 +22,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..cache import load_or_build
-from ..errors import check
+from ..errors import check, check_whole
 from ..footprint import Footprint
 from ..gaussian_lobes import SIGMA_H
 from ..hashing import pcg3d, uniform
 from ..kernels import SIGMA_MIN, TexelKernel
 from ..normalmap import NormalMap
 from ..synthesis import VERSION as MAP_VERSION
-from ..synthesis import Synthesis, check_sizes, check_whole, synthesise
+from ..synthesis import Synthesis, check_sizes, synthesise
 from . import lobe_levels, packed_lobes
 from .manifold import add_where
 from .mip_grids import Grids
@@ -201,20 +201,20 @@ class Mip:
             width, shift = (SIGMA_H + 0.5 / 3, 0.0) if mirrored else (SIGMA_H, 0.5)
             reach = self.texel_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
             centre = mi.Vector2f(reach.mean) + dr.select(texels, 0.5 - shift, 0.5)
-            rows, columns = grids.y.on(level, active), grids.x.on(level, active)
-            top = rows.locate(centre.y - reach.reach_v)
-            bottom = rows.locate(centre.y + reach.reach_v)
+            axis = grids.axis.on(level, active)
+            top = axis.locate(centre.y - reach.reach_v)
+            bottom = axis.locate(centre.y + reach.reach_v)
             extent = dr.gather(mi.Float, grids.extent, level, active)
         mean = mi.Vector2f(kernel.mean) + 0.5  # from the map's edge
 
         def next_row(y, x, right):
             y = y + 1
-            index, turn, flipped = rows.at(y)
+            index, turn, flipped = axis.at(y)
             borders = [
-                rows.placed(rows.border(index + k), turn, flipped) - centre.y for k in (0, 1)
+                axis.placed(axis.border(index + k), turn, flipped) - centre.y for k in (0, 1)
             ]
             start, stop = reach.row_extent(dr.minimum(*borders), dr.maximum(*borders))
-            return y, columns.locate(centre.x + start), columns.locate(centre.x + stop)
+            return y, axis.locate(centre.x + start), axis.locate(centre.x + stop)
 
         def next_grid(first, count, first_2, count_2, y, x, right, origin, sign):
             y, x, right = dr.if_stmt(
@@ -225,14 +225,12 @@ class Mip:
                 label="next row",
             )
             inside = y <= bottom
-            row, turn_y, flipped_y = rows.at(y)
-            column, turn_x, flipped_x = columns.at(x)
-            first, count, first_2, count_2 = grids.run(
-                level, rows, columns, row, column, flipped_x, inside
-            )
+            row, turn_y, flipped_y = axis.at(y)
+            column, turn_x, flipped_x = axis.at(x)
+            first, count, first_2, count_2 = grids.run(level, axis, row, column, flipped_x, inside)
             origin = mi.Vector2i(
-                columns.placed(columns.origin(column), turn_x, flipped_x),
-                rows.placed(rows.origin(row), turn_y, flipped_y),
+                axis.placed(axis.origin(column), turn_x, flipped_x),
+                axis.placed(axis.origin(row), turn_y, flipped_y),
             )
             if mirrored:
                 sign = mi.Vector2i(dr.select(flipped_x, -1, 1), dr.select(flipped_y, -1, 1))

@@ -14,12 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..lattice import floor_int
-from ..synthesis import Synthesis
-from .lobe_levels import Layout
+from ..synthesis import BEFORE_X, BEFORE_Y, Synthesis
+from .lobe_levels import Layout, morton
 
 
 class Axis:
-    """Grids along one axis of the map, which goes on for ever: repeated, or mirrored at its border.
+    """Grids along either axis of the map, which goes on for ever: repeated, or mirrored.
 
     Beyond the map, grids are counted on; :meth:`at` says which stored grid one looks like.
 
@@ -128,8 +128,7 @@ class Grids:
         self.layout = layout = Layout.of(synthesis)
         self.clusters, self.overlap = clusters, synthesis.overlap
         self.count = len(synthesis.patch)
-        self.x = Axis(synthesis, layout, mirrored)
-        self.y = Axis(synthesis, layout, mirrored)
+        self.axis = Axis(synthesis, layout, mirrored)
         self.divisions = len(layout.divisions)
         self.levels = 1 + self.divisions + len(layout.cells)
         self.patch = mi.UInt32(synthesis.patch.ravel())
@@ -156,14 +155,14 @@ class Grids:
     def nbytes(self) -> int:
         """Memory of the tables, bytes; the lobes are not counted."""
         tables = (self.patch, self.origins, self.owners, self.segments)
-        return 4 * sum(dr.width(v) for v in tables) + self.x.nbytes
+        return 4 * sum(dr.width(v) for v in tables) + self.axis.nbytes
 
     def may_have(self, m: mi.Vector2f, level, margin: mi.Float, active) -> mi.Bool:
         """Whether ``m`` is within the ``margin`` of normals that lobes of the level have."""
         lower, upper = (dr.gather(mi.Vector2f, self.normals, 2 * level + k, active) for k in (0, 1))
         return dr.all((m > lower - margin) & (m < upper + margin))
 
-    def run(self, level, row: AxisLevel, column: AxisLevel, y, x, flipped, active):
+    def run(self, level, axis: AxisLevel, y, x, flipped, active):
         """The lobes of the stored grid (``y``, ``x``): ``(first, count, first_2, count_2)``.
 
         The second run, of those in the cell's overlaps, is empty but for divisions of cells. For
@@ -172,7 +171,7 @@ class Grids:
         """
         first_of_level = dr.gather(mi.UInt32, self.first, level, active)
         texels, cells = level == 0, level > self.divisions
-        group = first_of_level + y * mi.UInt32(row.period) + x
+        group = first_of_level + y * mi.UInt32(axis.period) + x
         first = self.cells + group * self.clusters
         source, following = self.source(y, x, active & texels)
         first = dr.select(texels, source, first)
@@ -181,16 +180,16 @@ class Grids:
         first_2 = count_2 = mi.UInt32(0)
         if self.divisions:
             inside = active & ~texels & ~cells
-            n = 1 << row.split
+            n = 1 << axis.split
             part_y, part_x = y & (n - 1), x & (n - 1)
-            cell = (y >> row.split) * self.count + (x >> column.split)
+            cell = (y >> axis.split) * self.count + (x >> axis.split)
             patch = dr.gather(mi.UInt32, self.patch, cell, inside)
             group = patch * self.grids_per_patch + first_of_level + part_y * n + part_x
             first = dr.select(inside, self.inside + group * self.clusters, first)
             # Finer grids of the finest division, in Morton order, make up this one.
             finest = self.layout.divisions[0]
-            finer = 2 * (int(log2(finest)) - row.split)
-            place = cell * (finest**2 + 1) + (_morton(part_y, part_x, finest) << finer)
+            finer = 2 * (int(log2(finest)) - axis.split)
+            place = cell * (finest**2 + 1) + (morton(part_y, part_x, finest) << finer)
             begin = dr.gather(mi.UInt32, self.segments, place, inside)
             end = dr.gather(mi.UInt32, self.segments, place + (1 << finer), inside)
             first_2 = self.overlaps + begin
@@ -200,8 +199,8 @@ class Grids:
     def source(self, y: mi.UInt32, x: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         """The sample's texel that the texel (``y``, ``x``) of the map shows, and the number of
         texels from here on that it is known to go on without a break."""
-        cells, offsets, steps = [], [], []
-        for index, axis in ((y, self.y), (x, self.x)):
+        axis, cells, offsets, steps = self.axis, [], [], []
+        for index in (y, x):
             cell = dr.gather(mi.UInt32, axis.cell_of, index, active)
             begin = dr.gather(mi.UInt32, axis.starts, cell, active)
             end = dr.gather(mi.UInt32, axis.starts, cell + 1, active)
@@ -219,7 +218,7 @@ class Grids:
         cut = active & (above | beside)
         word = dr.gather(mi.UInt32, self.owners, place >> 4, cut)
         owner = dr.select(cut, (word >> ((place & 15) << 1)) & 3, 0)
-        for k, (axis, bit) in enumerate(((self.y, 2), (self.x, 1))):
+        for k, bit in enumerate((BEFORE_Y, BEFORE_X)):
             before = (owner & bit) != 0
             cell = dr.select(cells[k] == 0, self.count, cells[k]) - 1
             begin = dr.gather(mi.UInt32, axis.starts, cell, before)
@@ -237,11 +236,3 @@ def _packed_owners(owners: np.ndarray) -> np.ndarray:
     flat = owners.ravel().astype(np.uint32)
     flat = np.append(flat, np.zeros(-len(flat) % 16, np.uint32)).reshape(-1, 16)
     return np.bitwise_or.reduce(flat << (2 * np.arange(16, dtype=np.uint32)), axis=1)
-
-
-def _morton(y: mi.UInt32, x: mi.UInt32, limit: int) -> mi.UInt32:
-    """Index of a grid in Morton order, for indices below ``limit``, a power of two."""
-    result = mi.UInt32(0)
-    for bit in range(int(log2(limit))):
-        result |= (((y >> bit) & 1) << (2 * bit + 1)) | (((x >> bit) & 1) << (2 * bit))
-    return result

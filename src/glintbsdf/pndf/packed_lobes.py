@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..gaussian_lobes import Gaussian
+from .manifold import cross
 
 #: Standard deviations of footprint and lobe together beyond which a lobe counts for nothing: 0.2 %
 #: of the mass.
@@ -203,11 +204,6 @@ class SeenNormals:
         q_xx, q_yx, q_yy = self.rest
         vectors = (*self.vectors, mi.Vector2f(q_xx, q_yx), mi.Vector2f(0, q_yy))
         return self.mean + Gaussian(vectors, variance).sample(normal)
-
-
-def cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
-    """z component of the cross product."""
-    return dr.fma(a.x, b.y, -(a.y * b.x))
 
 
 def scaled_distance(vectors: tuple, d: mi.Vector2f, root: mi.Float) -> mi.Float:
