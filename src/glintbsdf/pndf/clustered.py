@@ -36,10 +36,10 @@ from . import manifold
 from .cluster_fit import fit_clusters
 from .manifold import (
     Manifold,
-    effective_triangle,
     equilateral,
     normal_in_quad,
     quad_density,
+    triangles_of_quad,
 )
 from .quad_lists import RESOLUTION, SHIFT, Builder, NormalCells, Packed, QuadLists, walk
 
