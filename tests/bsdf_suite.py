@@ -55,6 +55,37 @@ class View:
         return np.outer(self.du, self.du) + np.outer(self.dv, self.dv)
 
 
+def square(
+    bsdf: dict,
+    integrator: dict | None = None,
+    from_below: bool = False,
+    lights: dict | None = None,
+    spp: int = 16,
+) -> np.ndarray:
+    """A 24 × 24 picture of a square in the plane z = 0, in one bounce under a constant sky."""
+    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
+    if from_below:
+        camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator or {"type": "path", "max_depth": 2, "hide_emitters": True},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": camera,
+                "film": {"type": "hdrfilm", "width": 24, "height": 24},
+                "sampler": {"type": "independent", "sample_count": spp},
+            },
+            **(lights or {"sky": {"type": "constant"}}),
+            "square": {"type": "rectangle", "bsdf": bsdf},
+        }
+    )
+    image = np.array(mi.render(scene, seed=1))
+    assert np.isfinite(image).all() and (image >= 0).all()
+    return image
+
+
 # Views that break what is written carelessly, for a map of any size.
 EXTREME_VIEWS = {
     "point": View(),

@@ -236,36 +236,13 @@ def test_changed_parameters_take_effect(variant, method):
 # --------------------------------------------------------------------------------------------------
 
 
-def render(bsdf: dict, from_below: bool = False) -> np.ndarray:
-    """A 16 x 16 picture of a square in the plane z = 0 under a constant sky."""
-    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
-    if from_below:
-        camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 2, "hide_emitters": True},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": camera,
-                "film": {"type": "hdrfilm", "width": 16, "height": 16},
-                "sampler": {"type": "independent", "sample_count": 8},
-            },
-            "sky": {"type": "constant"},
-            "square": {"type": "rectangle", "bsdf": bsdf},
-        }
-    )
-    return np.array(mi.render(scene, seed=1))
-
-
 def test_one_sided_unless_wrapped(variant):
     bsdf = describe(MAPS["isotropic"], pixel_spread=0.03, reflectance=0.5)
-    assert 0.3 < render(bsdf).mean() < 0.6
-    assert render(bsdf, from_below=True).max() == 0
+    assert 0.3 < suite.square(bsdf).mean() < 0.6
+    assert suite.square(bsdf, from_below=True).max() == 0
     twosided = {"type": "twosided", "nested": bsdf}
-    assert np.allclose(render(twosided), render(bsdf), rtol=1e-4)
-    assert render(twosided, from_below=True).mean() > 0.3
+    assert np.allclose(suite.square(twosided), suite.square(bsdf), rtol=1e-4)
+    assert suite.square(twosided, from_below=True).mean() > 0.3
 
 
 def test_each_variant(each_variant):

@@ -299,35 +299,9 @@ def test_only_the_moments_of_the_method_are_kept(variant):
 # --------------------------------------------------------------------------------------------------
 
 
-def render(**parameters) -> np.ndarray:
-    """A 16 x 16 picture of a square in the plane z = 0 under a constant sky, in one bounce."""
-    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sky": {"type": "constant"},
-            "integrator": {"type": "path", "max_depth": 2, "hide_emitters": True},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": camera,
-                "film": {"type": "hdrfilm", "width": 16, "height": 16},
-                "sampler": {"type": "independent", "sample_count": 16},
-            },
-            "square": {
-                "type": "rectangle",
-                "bsdf": {"type": "twosided", "nested": describe(pixel_spread=0.03, **parameters)},
-            },
-        }
-    )
-    image = np.array(mi.render(scene, seed=1))
-    assert np.isfinite(image).all() and (image >= 0).all()
-    return image
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_renders(variant, method):
-    assert 0.3 < render(method=method).max() < 1.5
+    assert 0.3 < suite.square(describe(pixel_spread=0.03, method=method)).max() < 1.5
 
 
 def test_each_variant(each_variant):
@@ -335,7 +309,8 @@ def test_each_variant(each_variant):
     suite.check_eval_pdf(bsdf, RESOLVED, 200)
     suite.check_weights(bsdf, RESOLVED, 200)
     suite.check_finite(bsdf, RESOLVED)
-    assert 0.1 < render(method="toksvig", distribution="ggx", material="Au").max() < 2
+    gold = describe(pixel_spread=0.03, method="toksvig", distribution="ggx", material="Au")
+    assert 0.1 < suite.square(gold).max() < 2
 
 
 def test_describes_itself(variant):

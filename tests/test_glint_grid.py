@@ -521,27 +521,12 @@ def test_describes_itself(variant):
 
 
 def render(bsdf: dict, integrator: str = "path") -> np.ndarray:
-    """A square under a constant sky and a lamp, 24 × 24."""
-    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": integrator, "hide_emitters": True},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": camera,
-                "film": {"type": "hdrfilm", "width": 24, "height": 24},
-                "sampler": {"type": "independent", "sample_count": 64},
-            },
-            "sky": {"type": "constant", "radiance": 0.5},
-            "lamp": {"type": "point", "position": [0, 1, 2], "intensity": 2.0},
-            "square": {"type": "rectangle", "bsdf": bsdf},
-        }
-    )
-    image = np.array(mi.render(scene, seed=1))
-    assert np.isfinite(image).all() and (image >= 0).all()
-    return image
+    """A square under a constant sky and a lamp."""
+    lights = {
+        "sky": {"type": "constant", "radiance": 0.5},
+        "lamp": {"type": "point", "position": [0, 1, 2], "intensity": 2.0},
+    }
+    return suite.square(bsdf, {"type": integrator, "hide_emitters": True}, lights=lights, spp=64)
 
 
 @pytest.mark.parametrize("integrator", ["path", "direct", "prb", "volpath", "glint_path"])

@@ -341,31 +341,6 @@ def test_changed_parameters_are_checked(variant, key):
 # --------------------------------------------------------------------------------------------------
 
 
-def render(bsdf: dict, integrator: dict | None = None, from_below: bool = False) -> np.ndarray:
-    """A 24 x 24 picture of a square in the plane z = 0 under a constant sky, in one bounce."""
-    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
-    if from_below:
-        camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": integrator or {"type": "path", "max_depth": 2, "hide_emitters": True},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": camera,
-                "film": {"type": "hdrfilm", "width": 24, "height": 24},
-                "sampler": {"type": "independent", "sample_count": 16},
-            },
-            "sky": {"type": "constant"},
-            "square": {"type": "rectangle", "bsdf": bsdf},
-        }
-    )
-    image = np.array(mi.render(scene, seed=1))
-    assert np.isfinite(image).all() and (image >= 0).all()
-    return image
-
-
 def glints(**parameters) -> dict:
     return {
         **describe(MAPS["isotropic"], masking="beckmann", footprint_sigma=0.5, pixel_spread=0.03),
@@ -379,7 +354,7 @@ def texture(value: list[float]) -> dict:
 
 
 def test_adapters_that_change_nothing(variant):
-    plain = render(glints())
+    plain = suite.square(glints())
     assert plain.mean() > 0.1
     for adapter in (
         {"type": "twosided", "nested": glints()},
@@ -388,25 +363,25 @@ def test_adapters_that_change_nothing(variant):
         {"type": "blendbsdf", "weight": 0.0, "first": glints(), "second": {"type": "diffuse"}},
         {"type": "mask", "opacity": 1.0, "nested": glints()},
     ):
-        assert np.allclose(render(adapter), plain, rtol=1e-4), adapter["type"]
+        assert np.allclose(suite.square(adapter), plain, rtol=1e-4), adapter["type"]
 
 
 def test_one_sided(variant):
-    assert render(glints(), from_below=True).max() == 0
-    assert render({"type": "twosided", "nested": glints()}, from_below=True).mean() > 0.1
+    assert suite.square(glints(), from_below=True).max() == 0
+    assert suite.square({"type": "twosided", "nested": glints()}, from_below=True).mean() > 0.1
 
 
 @pytest.mark.parametrize("integrator", ["direct", "volpath", "prb", "glint_path"])
 def test_integrators(variant, integrator):
     extra = {} if integrator == "direct" else {"max_depth": 2}
-    image = render(glints(), {"type": integrator, "hide_emitters": True, **extra})
+    image = suite.square(glints(), {"type": integrator, "hide_emitters": True, **extra})
     # Four times the largest difference measured: a white sky leaves little noise.
-    assert np.isclose(image.mean(), render(glints()).mean(), rtol=0.01)
+    assert np.isclose(image.mean(), suite.square(glints()).mean(), rtol=0.01)
 
 
 def test_albedo_image(variant):
     integrator = {"type": "aov", "aovs": "albedo:albedo", "nested": {"type": "path"}}
-    image = render(glints(specular_reflectance=0.5), integrator)
+    image = suite.square(glints(specular_reflectance=0.5), integrator)
     assert np.allclose(image[12, 12, -3:], 0.5)
 
 
@@ -436,12 +411,12 @@ def test_prb_derivative(variant):
 
 
 def test_one_warning_of_a_point_footprint(variant, capfd):
-    render(glints(pixel_spread=0.0, id="a_plate"))
+    suite.square(glints(pixel_spread=0.0, id="a_plate"))
     captured = capfd.readouterr()
     text = captured.out + captured.err
     assert text.count("pixel_spread") == 2 and text.count("WARN") == 1
     assert "glintbsdf render" in text and "a_plate" in text
-    render(glints())
+    suite.square(glints())
     captured = capfd.readouterr()
     assert "WARN" not in captured.out + captured.err
 
@@ -453,7 +428,7 @@ def test_each_variant(each_variant):
     suite.check_finite(bsdf, RESOLVED)
     suite.check_finite(load(MAPS["scratched"]), RESOLVED)
     suite.check_finite(load(MAPS["scratched"], int_ior=1.5), RESOLVED)
-    value = render(glints(material="Au"))
+    value = suite.square(glints(material="Au"))
     assert 0.05 < value.mean() < 2
 
 
@@ -461,7 +436,7 @@ def test_plugin_survives_changes_of_variant(variant):
     means = []
     for name in (variant, variant.replace("rgb", "mono"), variant):
         mi.set_variant(name)
-        means.append(render(glints()).mean())
+        means.append(suite.square(glints()).mean())
     # The sky's grey is the same in every variant.
     assert np.allclose(means, means[0], rtol=0.02)
 
