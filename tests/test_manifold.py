@@ -128,6 +128,21 @@ def test_density_of_a_constant_gradient(variant):
     assert np.allclose(density, expected, rtol=2e-3)
 
 
+def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
+    """Across a step all are; their determinants, 0, are rounded to more than this epsilon."""
+    normals = np.zeros((32, 32, 2), np.float32)
+    normals[:, :16], normals[:, 16:] = (-0.3, 0), (0.6, 0.1)
+    pndf, middle, count = Manifold(NormalMap(normals), epsilon=1e-9), (0.15, 0.05), 100_000
+    footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.2)
+    s = np.array(draw(pndf, footprint, count))
+    drawn = (np.abs(s - np.array(middle)[:, None]) < 1e-3).all(axis=0).mean()
+    half = 1.1 * manifold.equilateral(1e-9)[0][1]  # of a square about all of their normals
+    s = np.array(middle)[:, None] + half * np.random.default_rng(4).uniform(-1, 1, (2, count))
+    mass = pndf.eval(mi.Vector2f(np.float32(s)), footprint).numpy().mean() * (2 * half) ** 2
+    # 0.03: their noise is 2 %; half of the triangles had been drawn, but not evaluated.
+    assert 0.02 < drawn and abs(mass / drawn - 1) < 0.1
+
+
 def test_memory(variant):
     """64 MB are allowed for 1024²."""
     assert Manifold(maps.isotropic(1024, seed=1)).nbytes <= 64e6

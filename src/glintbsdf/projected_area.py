@@ -45,7 +45,7 @@ from .kernels import TexelKernel, difference_of_products
 from .lattice import Lattice, floor_int
 from .microfacet import SmithMasking
 from .moments import MomentPyramid
-from .pndf.manifold import TexelMesh, add_where, cross, effective_triangle
+from .pndf.manifold import TexelMesh, add_where, cross, triangles_of_quad
 from .reach import Reach
 
 #: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
@@ -382,7 +382,7 @@ class ProjectedArea(FootprintArea):
 
     def triangles(self, row, column, active):
         """The effective triangles of a stored quad, each as first corner and two edges."""
-        return quad_triangles(self.mesh.quad_normals(row, column, active), self.mesh.epsilon)
+        return triangles_of_quad(self.mesh.quad_normals(row, column, active), self.mesh.epsilon)
 
     def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
         kernel = self.mesh.texel_kernel(footprint)
@@ -432,16 +432,6 @@ class ProjectedArea(FootprintArea):
             lambda: clipped_mean(corners, w.z, self.order),
             active,
         )
-
-
-def quad_triangles(normals, epsilon):
-    """Both effective triangles of a quad with the normals n0…n3: first corner and two edges."""
-    n0, n1, n2, n3 = normals
-    centre = 0.5 * (n1 + n2)
-    return (
-        effective_triangle(n0, n1, n2, centre, epsilon),
-        effective_triangle(n3, n2, n1, centre, epsilon),
-    )
 
 
 def triangle_weight(kernel: TexelKernel, corner, centroid: float):
@@ -700,7 +690,7 @@ def grazing_areas(normals, epsilon: float) -> list:
     linear, so that only the corners' slopes matter.
     """
     totals = None
-    for first, e1, e2 in quad_triangles(normals, epsilon):
+    for first, e1, e2 in triangles_of_quad(normals, epsilon):
         slopes = [
             m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
             for m in (first, first + e1, first + e2)

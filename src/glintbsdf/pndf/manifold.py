@@ -45,15 +45,17 @@ def equilateral(epsilon):
     return (0, r), (-sqrt(0.75) * r, -1.5 * r), (sqrt(0.75) * r, -1.5 * r)
 
 
-def effective_triangle(a, b, c, centre, epsilon):
+def effective_triangle(a, b, c, diagonal, epsilon):
     """The normal triangle n(Δ) on which sampling, evaluation and all bounds agree.
 
-    ``a``, ``b``, ``c``, ``centre`` (``mi.Vector2f``): projected normals at the vertices, and where
-    the replacement of a degenerate triangle is centred. Returns the first vertex and the edges
-    ``e1``, ``e2`` from it to the second and third.
+    ``a``, ``b``, ``c`` (``mi.Vector2f``): projected normals at the vertices. ``diagonal``: those of
+    the quad's (n1, n2), between which the replacement of a degenerate triangle is centred. Returns
+    the first vertex and the edges ``e1``, ``e2`` from it to the second and third.
     """
-    e1, e2 = b - a, c - a
-    tiny = dr.abs(cross(e1, e2)) < epsilon
+    n1, n2 = diagonal
+    e1, e2, centre = b - a, c - a, 0.5 * (n1 + n2)
+    # To the last digit the determinant of quad_density, so that both find the same ones degenerate.
+    tiny = dr.abs(cross(n2 - n1, a - n1)) < epsilon
     small_a, small_e1, small_e2 = (mi.Vector2f(*v) for v in equilateral(epsilon))
     return (
         dr.select(tiny, centre + small_a, a),
@@ -65,10 +67,9 @@ def effective_triangle(a, b, c, centre, epsilon):
 def triangles_of_quad(normals, epsilon):
     """The two effective triangles of a quad with the normals n0…n3."""
     n0, n1, n2, n3 = normals
-    centre = 0.5 * (n1 + n2)
     return (
-        effective_triangle(n0, n1, n2, centre, epsilon),
-        effective_triangle(n3, n2, n1, centre, epsilon),
+        effective_triangle(n0, n1, n2, (n1, n2), epsilon),
+        effective_triangle(n3, n2, n1, (n1, n2), epsilon),
     )
 
 
@@ -86,7 +87,7 @@ def frame_in_quad(l1, l2, normals, epsilon):
         dr.select(upper, n0, n3),
         dr.select(upper, n1, n2),
         dr.select(upper, n2, n1),
-        0.5 * (n1 + n2),
+        (n1, n2),
         epsilon,
     )
     sign = dr.select(upper, mi.Float(1), -1)

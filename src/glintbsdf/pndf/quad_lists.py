@@ -286,7 +286,7 @@ class QuadLists:
         ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
     """
 
-    VERSION = 1
+    VERSION = 2
 
     def __init__(
         self, lattice: Lattice, arrays: dict[str, np.ndarray], window: Window | None = None
