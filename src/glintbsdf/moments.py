@@ -17,9 +17,8 @@ minor axis has a standard deviation of at least 1.2 texels, and a 16th of the ma
 first and second moments are those of the continuous map under the footprint to 0.6 % and 0.9 %,
 root mean square over random footprints, relative to the map's root mean square slope and to its
 square. Narrower footprints mix the texels themselves in, whose mean squares exceed those of the
-interpolated normals: 1 to 9 % off at one texel, 2 to 42 % at half a texel. Nothing cheap mends
-that: levels of half a texel would take 2.9 times the memory; six by six points of the mesh, which
-alone take whole renders from 1.2 to 1.3 × ``roughconductor``, are still 3 % off at one texel.
+interpolated normals: 1 to 9 % off at one texel, 2 to 42 % at half a texel. Levels of half a texel
+would mend that, for 2.9 times the memory.
 
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
@@ -83,6 +82,41 @@ def level_below(variance):
 
 
 # ------------------------------------------------------------------------------------------------
+#  Central second moments
+# ------------------------------------------------------------------------------------------------
+#
+# A variance that is the difference of two averages, E[x²] − E[x]², has lost the digits in which
+# both agree. So what is kept are means, and then products of deviations from them; whoever averages
+# such records takes all of them about one origin, one of the means, first (Chan, Golub and LeVeque,
+# "Algorithms for Computing the Sample Variance", The American Statistician 1983). ``spread`` makes
+# the products of deviations; without it there are only means, and nothing to do.
+
+
+def origin_of(values: list, spread: Callable | None) -> list:
+    """The means of a record, for an origin; it is a constant, on which no average depends."""
+    return [] if spread is None else dr.detach(values[: len(values) - len(spread(values))])
+
+
+def about(origin: list, values: list, spread: Callable | None) -> list:
+    """A record with means and products about ``origin``, whose averages can be taken."""
+    if spread is None:
+        return values
+    deviations = [mean - x for mean, x in zip(values, origin, strict=False)]
+    products = zip(values[len(origin) :], spread(deviations), strict=True)
+    return deviations + [own + added for own, added in products]
+
+
+def central(origin: list, averages: list, spread: Callable | None) -> list:
+    """The record that averages about ``origin`` stand for."""
+    if spread is None:
+        return averages
+    deviations = averages[: len(origin)]
+    products = zip(averages[len(origin) :], spread(deviations), strict=True)
+    means = [x + deviation for x, deviation in zip(origin, deviations, strict=True)]
+    return means + [raw - excess for raw, excess in products]
+
+
+# ------------------------------------------------------------------------------------------------
 #  Building
 # ------------------------------------------------------------------------------------------------
 
@@ -118,7 +152,12 @@ def level_axis(texels: int, spacing: float, periodic: bool) -> Axis:
 
 
 def smooth(
-    channels: list, axes: tuple[Axis, Axis], along: int, target: Axis, variance: float
+    channels: list,
+    axes: tuple[Axis, Axis],
+    along: int,
+    target: Axis,
+    variance: float,
+    spread: Callable | None,
 ) -> list:
     """Average samples over a Gaussian along one axis, and take new samples of the result.
 
@@ -128,6 +167,7 @@ def smooth(
         along (int): which of them.
         target (Axis): where to sample.
         variance (float): of the Gaussian, texels².
+        spread: see :class:`MomentPyramid`.
     """
     source, other = axes[along], axes[1 - along]
     sample = dr.arange(mi.UInt32, target.count * other.count)
@@ -141,19 +181,24 @@ def smooth(
     sharpness = dr.opaque(mi.Float, source.spacing**2 / (2 * variance))
     place = dr.fma(mi.Float(index), step, first)
     nearest = floor_int(place + 0.5)
+
+    def sample_at(offset: int) -> list:
+        taken = source.wrapped(nearest + offset)
+        position = kept * source.count + taken if along == 1 else taken * other.count + kept
+        return [dr.gather(mi.Float, channel, position) for channel in channels]
+
+    origin = origin_of(sample_at(0), spread)
     totals, weights = [mi.Float(0) for _ in channels], mi.Float(0)
     reach = ceil(CUT * sqrt(variance) / source.spacing)
     for offset in range(-reach, reach + 1):
         distance = mi.Float(nearest + offset) - place
         weight = dr.exp(-sharpness * distance * distance)
-        taken = source.wrapped(nearest + offset)
-        position = kept * source.count + taken if along == 1 else taken * other.count + kept
         totals = [
-            dr.fma(weight, dr.gather(mi.Float, channel, position), total)
-            for channel, total in zip(channels, totals, strict=True)
+            dr.fma(weight, value, total)
+            for value, total in zip(about(origin, sample_at(offset), spread), totals, strict=True)
         ]
         weights += weight
-    return [total / weights for total in totals]
+    return central(origin, [total / weights for total in totals], spread)
 
 
 def all_texels(normals, texels: tuple[Axis, Axis], axes: tuple[Axis, Axis]):
@@ -196,16 +241,29 @@ def quad_averages(over_quad: Callable, normals, axes: tuple[Axis, Axis]):
     return over_quad(corners), quads
 
 
-def midpoint_rule(moments: Callable, corners: list) -> list:
+def record_of(moments: Callable, spread: Callable | None, normal) -> list:
+    """The record of a single normal, which deviates from nothing."""
+    means = moments(normal)
+    products = [] if spread is None else spread(means)
+    return means + [dr.zeros(mi.Float, dr.width(normal)) for _ in products]
+
+
+def midpoint_rule(moments: Callable, spread: Callable | None, corners: list) -> list:
     """Averages over a quad of moments of its normals, by the midpoints of its triangles' edges.
 
     Over the two triangles of a quad the projected normal is linear. The rule integrates its
     quadratic polynomials exactly, and slopes are almost linear in it.
     """
     n0, n1, n2, n3 = corners
-    edges = ((n0, n1, 1), (n0, n2, 1), (n1, n2, 2), (n1, n3, 1), (n2, n3, 1))
-    parts = [[weight / 6 * x for x in moments(0.5 * (a + b))] for a, b, weight in edges]
-    return [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
+    edges = ((n1, n2, 2), (n0, n1, 1), (n0, n2, 1), (n1, n3, 1), (n2, n3, 1))
+    records = [record_of(moments, spread, 0.5 * (a + b)) for a, b, _ in edges]
+    origin = origin_of(records[0], spread)
+    parts = [
+        [weight / 6 * x for x in about(origin, record, spread)]
+        for record, (*_, weight) in zip(records, edges, strict=True)
+    ]
+    averages = [sum(part[1:], part[0]) for part in zip(*parts, strict=True)]
+    return central(origin, averages, spread)
 
 
 def samples_within(axis: Axis, first: float, last: float) -> tuple[int, int]:
@@ -295,6 +353,11 @@ class MomentPyramid:
         moments: function of projected normals (``mi.Vector2f``) that returns a list of ``mi.Float``
             whose averages are wanted, any number of them. None for a chain without the texels
             themselves, for footprints no narrower than level 1.
+        spread: function of deviations, a list as ``moments`` returns it, that returns a list of
+            products of them. Their averages over the footprint, central second moments, follow the
+            averages of ``moments`` in everything that is stored and returned.
+        between (bool): whether what means differ by between samples of the chain, and between
+            lookups, adds to those products.
         finish: function from the averages of a sample of the chain to what is stored there and
             interpolated; by default the averages themselves.
         max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
@@ -317,7 +380,10 @@ class MomentPyramid:
         max_anisotropy: float = 16.0,
         over_quad: Callable | None = None,
         reach: Reach | None = None,
+        spread: Callable | None = None,
+        between: bool = True,
     ) -> None:
+        self.spread = spread if between else None
         self.height, self.width, _ = data.shape
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
         self.periodic = wrap_mode != "clamp"
@@ -346,13 +412,14 @@ class MomentPyramid:
             stored.append(finish(cut_out(level, shapes[k], windows[k])))
 
         if self.first == 0:
-            keep(moments(all_texels(normals, texels, axes_of(0))))
-        level, axes = quad_averages(over_quad or partial(midpoint_rule, moments), normals, texels)
+            keep(record_of(moments, spread, all_texels(normals, texels, axes_of(0))))
+        over_quad = over_quad or partial(midpoint_rule, moments, spread)
+        level, axes = quad_averages(over_quad, normals, texels)
         variance = 1 / 12  # of a quad, along each axis
         for number in range(1, self.top + 1):
             sigma, target = level_sigma(number), axes_of(number)
             for along in (0, 1):
-                level = smooth(level, axes, along, target[along], sigma**2 - variance)
+                level = smooth(level, axes, along, target[along], sigma**2 - variance, spread)
                 axes = (target[0], axes[1]) if along == 0 else target
                 dr.eval(level)
             variance = sigma**2
@@ -445,11 +512,12 @@ class MomentPyramid:
         grids = [self.grid(level), self.grid(level + 1)]
         steps = dr.select(active, steps, -1)  # none at all, as they go from −steps to steps
         step = major * step
+        origin = self.nearest_means(kernel.mean, grids[0])
 
         # What derivatives flow through is part of the loop's state: they do not find it otherwise.
         def body(k, mean, step, variance, sharpness, weights, *totals):
             weight = dr.exp(-sharpness * k * k)
-            values = self.lookup(mean + k * step, variance, grids)
+            values = self.lookup(mean + k * step, variance, grids, origin)
             totals = [dr.fma(weight, x, total) for x, total in zip(values, totals, strict=True)]
             return k + 1, mean, step, variance, sharpness, weights + weight, *totals
 
@@ -462,7 +530,7 @@ class MomentPyramid:
             label="taps",
         )[5:]
         weights = dr.select(active, weights, 1)
-        return [total / weights for total in totals]
+        return central(origin, [total / weights for total in totals], self.spread)
 
     def grid(self, level) -> Grid:
         """The samples of a level (``mi.Float``)."""
@@ -478,20 +546,20 @@ class MomentPyramid:
             mi.Vector2f(0.5 * dr.rcp(dr.square(scale_x)), 0.5 * dr.rcp(dr.square(scale_y))),
         )
 
-    def lookup(self, position, variance, grids) -> list:
+    def lookup(self, position, variance, grids, origin: list) -> list:
         """The mixture, at a position, of a level and the next that has this variance."""
         (fine, fine_variance), (coarse, coarse_variance) = (
-            self.bilinear(position, grid) for grid in grids
+            self.bilinear(position, grid, origin) for grid in grids
         )
         weight = dr.clip((variance - fine_variance) * dr.rcp(coarse_variance - fine_variance), 0, 1)
         return [dr.lerp(a, b, weight) for a, b in zip(fine, coarse, strict=True)]
 
-    def bilinear(self, position, grid: Grid):
-        """What a level says at a position, and the variance (texels²) of the kernel there."""
+    def corners(self, position, grid: Grid):
+        """First and second sample (``mi.Vector2u``: column, row) of a level on either side of a
+        position along each axis, and where between them it lies, from 0 to 1."""
         count = grid.count
         place = (position + 0.5) * grid.scale + (-0.5 if self.periodic else BORDER - 0.5)
         corner = dr.floor(place)
-        f = place - corner
         if self.wraps:
             first = corner - count * dr.floor((corner + 0.5) * grid.inverse_count)
             second = dr.select(first + 1 < count, first + 1, 0)
@@ -499,15 +567,34 @@ class MomentPyramid:
             first, second = (mi.Vector2i(corner + k) for k in (0, 1))  # may be below 0
         else:
             first, second = (dr.clip(corner + k, 0, count - 1) for k in (0, 1))
-        (x0, y0), (x1, y1) = mi.Vector2u(first), mi.Vector2u(second)
+        return mi.Vector2u(first), mi.Vector2u(second), place - corner
+
+    def record(self, index) -> list:
+        """What is stored at an index."""
+        values = [x for records in self.records for x in dr.gather(mi.Vector4f, records, index)]
+        if self.single is not None:
+            values.append(dr.gather(mi.Float, self.single, index))
+        return values[: self.channels]
+
+    def nearest_means(self, position, grid: Grid) -> list:
+        """The means of a level's sample that is nearest to a position, for an origin."""
+        if self.spread is None:
+            return []
+        first, second, f = self.corners(position, grid)
+        x, y = dr.select(f < 0.5, first, second)
+        return origin_of(self.record(grid.offset + y * grid.pitch + x), self.spread)
+
+    def bilinear(self, position, grid: Grid, origin: list):
+        """What a level says at a position, and the variance (texels²) of the kernel there."""
+        (x0, y0), (x1, y1), f = self.corners(position, grid)
         rows = [grid.offset + y * grid.pitch for y in (y0, y1)]
-        index = [row + x for row in rows for x in (x0, x1)]
         weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
-        averages = []
-        for kind, records in [(mi.Vector4f, x) for x in self.records] + (
-            [] if self.single is None else [(mi.Float, self.single)]
-        ):
-            value = sum(dr.gather(kind, records, i) * w for i, w in zip(index, weight, strict=True))
-            averages += list(value) if kind is mi.Vector4f else [value]
+        records = [
+            about(origin, self.record(row + x), self.spread) for row in rows for x in (x0, x1)
+        ]
+        averages = [
+            sum(value * w for value, w in zip(values, weight, strict=True))
+            for values in zip(*records, strict=True)
+        ]
         # Between two samples, weighed 1 − f and f, interpolation adds the variance f (1 − f) h².
-        return averages[: self.channels], grid.variance + dr.dot(f * (1 - f), grid.half_square)
+        return averages, grid.variance + dr.dot(f * (1 - f), grid.half_square)
