@@ -152,6 +152,37 @@ def test_quadrature_finds_spikes_of_any_size(measures):
     assert measures.suite.p_value(measures.count_in(cells, wider), len(test), mass, error) < 1e-5
 
 
+def test_quadrature_is_led_to_needles_by_few_samples(measures, monkeypatch):
+    # As of 16 degenerate triangles: a thousandth of the mass each, in a quarter of the square.
+    rng = np.random.default_rng(2)
+    centres, radius = rng.uniform(0.1, 0.9, (16, 2)), 1e-5
+
+    def density(s):
+        near = (np.linalg.norm(s[:, None] - centres, axis=2) < radius).sum(1)
+        return 0.984 / 2 * (s[:, 0] < 0) + 0.001 * near / (np.pi * radius**2)
+
+    points = rng.uniform((-1, -1), (0, 1), (20_000, 2))
+    r, angle = radius * np.sqrt(rng.random(320)), rng.uniform(0, 2 * np.pi, 320)
+    offset = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
+    points[:320] = centres[rng.integers(0, 16, 320)] + offset
+    monkeypatch.setattr(measures, "MOST_BOXES", 4)  # cut nowhere but where samples say so
+    cells = np.array([[[-1, -1], [0, 1]], [[0, -1], [1, 1]]], float)
+    mass, error = measures.mass_of(density, cells, points, (points[:, 0] >= 0).astype(int))
+    # Where none is led to, both mass and error are 0.
+    assert error[1] < 0.02 and (np.abs(mass - [0.984, 0.016]) < 4 * error + 1e-4).all()
+
+
+def test_view_that_sees_no_facet(measures, stability):
+    bsdf = mi.load_dict(stability.Row("manifold", "tilted").description())
+    view = measures.View(wi=(-1, 0.4, 0.05))
+    assert (np.array(measures.suite.sample(bsdf, view, 100)[1].pdf) == 0).all()
+    found = measures.density(bsdf, view, 100)
+    assert found == {"mass": 0.0, "mass_error": 0.0, "p_value": 1.0}
+    # A density that no sample has is found out.
+    stated = measures.density(Stated(bsdf, lambda *x: mi.Float(0.1)), view, 100)
+    assert stated["mass"] > 0.05
+
+
 class Stated:
     """A BSDF that states another density than the one it draws from."""
 
