@@ -138,7 +138,7 @@ class GlintElements(GlintBSDF):
             )
         else:
             self.pndf = Elements(
-                parameters.normal_map(),
+                parameters.normal_map(instead="flake_density"),
                 sigma_r,
                 parameters.number("step", 0.5),
                 parameters.choice("elements", "curved", ("curved", "flat")) == "curved",

@@ -44,6 +44,13 @@ def test_a_missing_package_is_fatal_and_has_a_command():
     assert finding.fatal and "-m pip install no-such-package-glintbsdf" in finding.remedy
 
 
+def test_a_missing_optional_package_is_not_fatal(report):
+    finding = doctor._package("no-such-package-glintbsdf", "render --denoise")
+    assert not finding.fatal and "optional: for render --denoise" in finding.value
+    assert "-m pip install no-such-package-glintbsdf" in finding.remedy
+    assert "mitsuba-oidn" in report
+
+
 def test_an_unusable_llvm_has_a_remedy(monkeypatch):
     monkeypatch.setattr(llvm, "loaded_version", lambda: (15, 0, 6))
     monkeypatch.setattr(llvm, "find", lambda: [llvm.Library((15,), "/lib/libLLVM-15.so.1")])

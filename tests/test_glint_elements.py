@@ -180,6 +180,7 @@ def test_shared_parameters_are_checked(variant, changes, parameter):
         ({"step": float("inf")}, "step"),
         ({"elements": "bent"}, "elements"),
         ({"masking": "ggx_fit"}, "masking"),
+        ({"data": None}, "flake_density"),  # neither map nor flakes
         ({"flake_density": 100.0}, "flake_density"),  # besides a map
         ({"flake_alpha": 0.2}, "flake_alpha"),  # without flakes
     ],

@@ -37,6 +37,31 @@ def test_choices_and_booleans(variant):
             parameters(a=value).boolean("a", True)
 
 
+def test_what_excludes_each_other_is_named(variant):
+    def message(action) -> str:
+        with pytest.raises(ParameterError) as caught:
+            action()
+        return str(caught.value)
+
+    given = parameters(filename="a.exr", flake_density=9.0)
+    assert message(lambda: given.only_one_of(("filename", "data"), ("flake_density",))) == (
+        'glint_test: "filename" and "flake_density" exclude each other '
+        "(got filename, flake_density)"
+    )
+    given = parameters(alpha=0.1, alpha_u=0.1, alpha_v=0.2)
+    assert message(lambda: given.per_axis("alpha", 0.3)) == (
+        'glint_test: "alpha" and "alpha_u" exclude each other (got alpha, alpha_u, alpha_v)'
+    )
+
+
+def test_a_missing_map_is_told_with_what_may_take_its_place(variant):
+    begin = r'glint_test: one of "filename", "bitmap" or "data" must give the normal or height map'
+    with pytest.raises(ParameterError, match=begin + r" \(got none of them\)"):
+        parameters().normal_map()
+    with pytest.raises(ParameterError, match=begin + r', or "flakes" take its place \(got none'):
+        parameters().normal_map(instead="flakes")
+
+
 def test_reading_marks_a_property_as_known(variant):
     given = parameters(a=1.0, b=2.0)
     given.number("a", 0.0)

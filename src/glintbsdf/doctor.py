@@ -14,7 +14,10 @@ import mitsuba as mi
 
 from . import __version__, llvm
 
-_PACKAGES = ("numpy", "OpenEXR", "scikit-image", "click", "rich", "platformdirs")
+_PACKAGES = ("numpy", "scipy", "OpenEXR", "scikit-image", "click", "rich", "platformdirs")
+
+#: Packages that only some need, and what for.
+_OPTIONAL = {"mitsuba-oidn": "render --denoise"}
 
 # One kernel per variant, in a process of its own: a backend that does not work may abort it.
 _PROBE = """
@@ -49,6 +52,7 @@ def examine() -> list[Finding]:
         Finding("Mitsuba", mi.__version__),
         Finding("Dr.Jit", dr.__version__),
         *map(_package, _PACKAGES),
+        *(_package(name, use) for name, use in _OPTIONAL.items()),
         *_llvm(),
         _cuda(),
         _threads(),
@@ -56,11 +60,13 @@ def examine() -> list[Finding]:
     ]
 
 
-def _package(name: str) -> Finding:
+def _package(name: str, use: str = "") -> Finding:
+    """``use``: what alone needs the package; without it everything does."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
-        return Finding(name, "missing", f"{sys.executable} -m pip install {name}", fatal=True)
+        value = "missing" + (f" (optional: for {use})" if use else "")
+        return Finding(name, value, f"{sys.executable} -m pip install {name}", fatal=not use)
 
 
 def _llvm() -> list[Finding]:

@@ -68,27 +68,30 @@ class Parameters:
 
     def only_one_of(self, *groups: tuple[str, ...]) -> None:
         """Refuse properties of more than one of the ``groups``, which contradict each other."""
-        given = [name for group in groups for name in group if name in self.props]
-        if sum(any(name in self.props for name in group) for group in groups) > 1:
-            choices = " or ".join(" and ".join(f'"{name}"' for name in group) for group in groups)
-            raise ParameterError(
-                f"{self.owner}: {choices} exclude each other (got {', '.join(given)})"
-            )
+        given = [[name for name in group if name in self.props] for group in groups]
+        given = [group for group in given if group]
+        if len(given) > 1:
+            choices = " and ".join(f'"{group[0]}"' for group in given)
+            got = ", ".join(name for group in given for name in group)
+            raise ParameterError(f"{self.owner}: {choices} exclude each other (got {got})")
 
     # ----------------------------------------------------------------------------------------------
     #  The normal map
     # ----------------------------------------------------------------------------------------------
 
-    def normal_map(self) -> NormalMap:
+    def normal_map(self, instead: str = "") -> NormalMap:
         """The map from ``filename``, ``bitmap`` or ``data``; a relative file name is resolved with
-        ``mi.file_resolver()``, against the scene's folder."""
+        ``mi.file_resolver()``, against the scene's folder.
+
+        ``instead``: a parameter that may be given in place of a map, for the message of the error.
+        """
         self.only_one_of(*((source,) for source in MAP_SOURCES))
         sources = [source for source in MAP_SOURCES if source in self.props]
         if not sources:
-            raise ParameterError(
-                f'{self.owner}: one of "filename", "bitmap" or "data" must give '
-                "the normal or height map (got none of them)"
-            )
+            requirement = 'one of "filename", "bitmap" or "data" must give the normal or height map'
+            if instead:
+                requirement += f', or "{instead}" take its place'
+            raise ParameterError(f"{self.owner}: {requirement} (got none of them)")
         source = sources[0]
         value = self.props[source]
         options = {
