@@ -212,9 +212,12 @@ class TexelMesh:
 
     def quad_normals(self, row, column, active=True):
         """Projected normals n0…n3 of a stored quad (Eq. 3)."""
+        # Number by number: as vectors, they take a fifth more of a query's time on LLVM.
         return [
-            dr.gather(mi.Vector2f, self.vertices, mi.UInt32(index), active)
-            for index in self.lattice.corners(row, column)
+            mi.Vector2f(
+                *(dr.gather(mi.Float, self.vertices, 2 * mi.UInt32(i) + k, active) for k in (0, 1))
+            )
+            for i in self.lattice.corners(row, column)
         ]
 
     def effective_triangles(self, row, column, active=True):

@@ -80,63 +80,64 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
     The lattice's blocks have the side ``1 << shift``, a number or one per lane (``mi.Int``).
     ``run_of(row of blocks, first block, last block, active)`` returns begin and end of a run of
     consecutive entries, ``place_of(entry, first row of the row of blocks, active)`` the row and
-    column that an entry stands for, and whatever else ``add`` is to be given. One flat loop,
-    because lanes that walk nested loops wait for each other at the end of every inner one. The sum
-    begins with ``zero``, as in :func:`every_quad`.
+    column that an entry stands for, and whatever else ``add`` is to be given. The sum begins with
+    ``zero``, as in :func:`every_quad`.
+
+    One loop over the runs, and one in it over a run's entries. In a flat one, which no lane leaves
+    before all are done, nearly every step is the first of a run to some of the lanes, so that all
+    wait while it is found; to wait at the end of the runs is cheaper by a third.
     """
     columns, rows = lattice.x, lattice.y
     mean = mi.Vector2f(kernel.mean)
     bottom = floor_int(mean.y + kernel.reach_v)
 
-    def next_row(x, right, next_y, origin_y, row):
-        """The next row of blocks, and its extent under the kernel."""
-        origin_y, y, end = rows.locate(next_y)
-        row = (y >> shift) << shift
-        next_y = origin_y + dr.minimum(row + (1 << shift), end)
+    def body(x, right, next_y, origin_y, row, active, density):
+        # The next row of blocks where this one is done, and its extent under the kernel.
+        new_row = x > right
+        active = active & ~(new_row & (next_y > bottom))
+        origin, y, row_end = rows.locate(next_y)
+        first_row = (y >> shift) << shift
+        below = origin + dr.minimum(first_row + (1 << shift), row_end)
         start, stop = kernel.row_extent(
-            mi.Float(origin_y + row) - mean.y, mi.Float(next_y) - mean.y
+            mi.Float(origin + first_row) - mean.y, mi.Float(below) - mean.y
         )
-        x, right = floor_int(mean.x + start), floor_int(mean.x + stop)
-        return x, right, next_y, origin_y, row
-
-    def next_run(entry, end, x, right, y, next_y, origin_x, origin_y, row, active):
-        """The next run of consecutive entries."""
-        new_row = active & (x > right)
-        y = dr.select(new_row, next_y, y)
-        x, right, next_y, origin_y, row = dr.if_stmt(
-            (x, right, next_y, origin_y, row),
-            new_row,
-            next_row,
-            lambda *state: state,
-            label="next row",
+        x, right, next_y, origin_y, row = (
+            dr.select(new_row, new, old)
+            for new, old in (
+                (floor_int(mean.x + start), x),
+                (floor_int(mean.x + stop), right),
+                (below, next_y),
+                (origin, origin_y),
+                (first_row, row),
+            )
         )
-        active = active & (y <= bottom)
+        # Its next run: as far as blocks are stored side by side.
         origin_x, column, column_end = columns.locate(x)
         last = dr.minimum(right - origin_x, column_end - 1) >> shift
         entry, end = run_of(
             mi.UInt32(row >> shift), mi.UInt32(column >> shift), mi.UInt32(last), active
         )
         x = origin_x + dr.minimum((last + 1) << shift, column_end)
-        return entry, end, x, right, y, next_y, origin_x, origin_y, row, active
 
-    def body(*state):
-        *run, density = state
-        entry, end, active = run[0], run[1], run[-1]
-        run = dr.if_stmt(
-            tuple(run), active & (entry >= end), next_run, lambda *run: run, label="next run"
+        def add_entry(entry, density):
+            found = active & (entry < end)
+            place = place_of(entry, row, found)
+            corner = mi.Vector2f(origin_x + place[1], origin_y + place[0]) - mean
+            return entry + 1, add(density, *place, corner, found)
+
+        _, density = dr.while_loop(
+            (entry, density),
+            lambda entry, _: active & (entry < end),
+            add_entry,
+            max_iterations=-1,
+            label="entries",
         )
-        entry, end, _, _, _, _, origin_x, origin_y, row, active = run
-        found = active & (entry < end)
-        place = place_of(entry, row, found)
-        corner = mi.Vector2f(origin_x + place[1], origin_y + place[0]) - mean
-        density = add(density, *place, corner, found)
-        return entry + 1, *run[1:], density
+        return x, right, next_y, origin_y, row, active, density
 
+    top = floor_int(mean.y - kernel.reach_v)
     none = mi.Int(0)
-    y = floor_int(mean.y - kernel.reach_v)
-    run = (mi.UInt32(0), mi.UInt32(0), none, none - 1, y, y, none, none, none)
     zero = mi.Float(0) if zero is None else zero
-    state = (*(type(v)(v) for v in run), mi.Bool(active), zero)
+    state = (none + 0, none - 1, top, none + 0, none + 0, mi.Bool(active), zero)
     return dr.while_loop(
         state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
     )[-1]
