@@ -107,6 +107,8 @@ section 5.
 
 from __future__ import annotations
 
+from functools import partial
+
 import mitsuba as mi
 
 from glintbsdf.bsdf import GlintBSDF
@@ -118,6 +120,7 @@ from glintbsdf.microfacet import (
 )
 from glintbsdf.parameters import MAP_SOURCES, Parameters
 from glintbsdf.pndf import Elements, Flakes
+from glintbsdf.reach import Reach
 
 
 class GlintElements(GlintBSDF):
@@ -128,6 +131,7 @@ class GlintElements(GlintBSDF):
         parameters = Parameters(props)
         parameters.only_one_of(MAP_SOURCES, ("flake_density",))
         sigma_r = parameters.number("sigma_r", 0.005)
+        masked = parameters.choice("masking", "beckmann", ("beckmann", "none")) == "beckmann"
         if "flake_density" in props:
             self.pndf = Flakes(
                 parameters.number("flake_density", 0.0),
@@ -136,23 +140,26 @@ class GlintElements(GlintBSDF):
                 props.get("seed", 0),
                 self.owner,
             )
-        else:
-            self.pndf = Elements(
-                parameters.normal_map(instead="flake_density"),
-                sigma_r,
-                parameters.number("step", 0.5),
-                parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
-                self.owner,
-            )
-        self.masking = None
-        if parameters.choice("masking", "beckmann", ("beckmann", "none")) == "beckmann":
-            self.masking = (
-                BeckmannMasking(mi.Vector2f(self.pndf.alpha**2))
-                if isinstance(self.pndf, Flakes)
-                else MapBeckmannMasking(self.pndf)
-            )
-        smooth = FlakesBeckmannLobe if isinstance(self.pndf, Flakes) else MapBeckmannLobe
-        self.smooth = smooth(self.pndf)
+            self.masking = BeckmannMasking(mi.Vector2f(self.pndf.alpha**2)) if masked else None
+            self.smooth = FlakesBeckmannLobe(self.pndf)
+            return
+        self.normal_map = parameters.normal_map(instead="flake_density")
+        self.create = partial(
+            Elements,
+            self.normal_map,
+            sigma_r,
+            parameters.number("step", 0.5),
+            parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
+            self.owner,
+        )
+        self.create_masking = MapBeckmannMasking if masked else lambda pndf: None
+        if not self.waits:
+            self.build()
+
+    def build(self, reach: Reach | None = None) -> None:
+        self.pndf = self.create(reach=reach)
+        self.masking = self.create_masking(self.pndf)
+        self.smooth = MapBeckmannLobe(self.pndf)
 
 
 mi.register_bsdf("glint_elements", lambda props: GlintElements(props))

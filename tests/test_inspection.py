@@ -101,7 +101,9 @@ def test_survey_leaves_the_scene_as_it_was(folder):
     assert inspected.scene.sensors()[0].sampler().sample_count() == 64
 
 
-@pytest.mark.parametrize("plugin", ["glint_manifold", "glint_filtered", "glint_diffuse"])
+@pytest.mark.parametrize(
+    "plugin", ["glint_manifold", "glint_elements", "glint_filtered", "glint_diffuse"]
+)
 @pytest.mark.parametrize("path", [("path", 2), ("glint_path", 6)], ids=["direct", "indirect"])
 def test_trimmed_rendering_is_the_same(folder, plugin, path):
     parameters = {"plugin": plugin, "integrator": path[0], "depth": path[1]}

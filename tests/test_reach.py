@@ -14,6 +14,7 @@ from glintbsdf.diffuse import OrenNayarDiffuse
 from glintbsdf.lattice import Lattice
 from glintbsdf.pndf import (
     ClusteredManifold,
+    Elements,
     Filtered,
     HandOver,
     Manifold,
@@ -142,6 +143,17 @@ def test_small_footprints_need_no_lists(variant):
     assert trimmed.parts["lists of quads"] == 0
     expected = Manifold(normal_map()).eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.7, 3.0])
+@pytest.mark.parametrize("step", [0.5, 1.6])
+def test_elements_under_small_footprints_need_no_lists(variant, step, sigma):
+    footprint, m = footprints(sigma=sigma), normals()
+    trimmed = Elements(normal_map(), step=step, reach=recorded(normal_map(), footprint))
+    complete = Elements(normal_map(), step=step)
+    expected = complete.eval(m, footprint).numpy()
+    assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
+    assert (trimmed.nbytes < complete.nbytes) == (sigma == 0.1)
 
 
 @pytest.mark.parametrize("sigma", [0.1, 1.0, 6.0])

@@ -21,11 +21,13 @@ import numpy as np
 
 from ..cache import load_or_build
 from ..errors import check
+from ..footprint import Footprint
 from ..gaussian_lobes import SIGMA_H, Gaussian, Overlap, lattice_mass
 from ..hashing import pcg3d, uniform
 from ..kernels import TexelKernel
 from ..lattice import BLOCK, Lattice, floor_int
 from ..normalmap import NormalMap
+from ..reach import Reach
 from .quad_lists import QuadLists, every_quad
 
 #: Of the lists; part of their name in the cache.
@@ -130,7 +132,8 @@ class Mixture:
 
     Attributes:
         lattice (Lattice): the cells, with ``map_cells`` (columns, rows) of them to a map.
-        lists (QuadLists): the cells whose elements may show a normal.
+        lists (QuadLists): the cells whose elements may show a normal; None where all footprints
+            are small.
         variance (float): of S, cells².
         sigma_r (mi.Float): standard deviation σ_r of the normals of a flat element.
         wrap_mode (str): what lies beyond the map.
@@ -225,8 +228,9 @@ class Mixture:
             return sums + dr.select(cell[-1], total, 0)
 
         density, mass = self.sum_all(kernel, add_both, active & few, mi.Vector2f(0))
-        listed = active & ~few & self.lists.covers(m)
-        density = density + self.lists.visit(m, kernel, add, listed)
+        if self.lists is not None:
+            listed = active & ~few & self.lists.covers(m)
+            density = density + self.lists.visit(m, kernel, add, listed)
         # Under the fade, this share of a Gaussian is left.
         faded = 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
         gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
@@ -283,7 +287,13 @@ class Mixture:
     @property
     def nbytes(self) -> int:
         """Memory of elements and lists, bytes."""
-        return self.element_bytes + self.lists.nbytes
+        return sum(self.parts.values())
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        lists = 0 if self.lists is None else self.lists.nbytes
+        return {"elements": self.element_bytes, "lists of elements": lists}
 
 
 def draw_neighbour(x, random):
@@ -320,6 +330,8 @@ class Elements(Mixture):
             steps makes the map.
         curved (bool): whether elements follow the map's Jacobian (Eq. 13) or are flat (Eq. 12).
         owner (str): whom errors name, usually the plugin.
+        reach (Reach): what will be asked; None for anything. Where all footprints are summed cell
+            by cell, no lists are made; within the reach D is the same to the last bit.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it and through
@@ -339,11 +351,12 @@ class Elements(Mixture):
         step: float = 0.5,
         curved: bool = True,
         owner: str = "Elements",
+        reach: Reach | None = None,
     ) -> None:
         check_sigma_r(owner, sigma_r)
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
-        self.wrap_mode = normal_map.wrap_mode
+        self.wrap_mode, self.reach = normal_map.wrap_mode, reach
         self.data = mi.TensorXf(normal_map.normals)
         self.sigma_r = mi.Float(sigma_r)
         key = f"elements {VERSION} {normal_map.content_hash} {sigma_r!r} {step!r} {curved}"
@@ -378,7 +391,18 @@ class Elements(Mixture):
         self.anchors = self.places
         if self.aligned and self.curved:
             self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
-        self.lists = QuadLists(self.lattice, cached(self.build_lists))
+        self.lists = None
+        if self.reach is None or not self.all_small(self.reach.largest):
+            self.lists = QuadLists(self.lattice, cached(self.build_lists))
+
+    def all_small(self, sigma: float) -> bool:
+        """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
+        cell: the round one of this size covers most cells."""
+        height, width, _ = self.data.shape
+        largest = Footprint(
+            mi.Point2f(0), mi.Vector2f(sigma / width, 0), mi.Vector2f(0, sigma / height)
+        )
+        return bool(dr.all(self.weights(largest)[1]))
 
     # --------------------------------------------------------------------------------------------
     #  The elements
