@@ -48,7 +48,8 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
  * - overlap
    - |int|
    - Texels by which patches reach into each other, at least 1 and fewer than half a patch's. More
-     of them make seams smoother: 8, where the map is smooth. (Default: 2)
+     of them make seams smoother; fewer leave more lobes to what is clustered at them. (Default: an
+     eighth of :monosp:`patch_size`)
 
  * - balance
    - |float|
@@ -159,10 +160,11 @@ class GlintMip(GlintBSDF):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
-        sizes = {"output_size": 4096, "patch_size": 64, "overlap": 2, "clusters": 32, "seed": 0}
+        sizes = {"output_size": 4096, "patch_size": 64, "clusters": 32, "seed": 0}
         self.pndf = Mip(
             parameters.normal_map(),
             **{name: props.get(name, default) for name, default in sizes.items()},
+            overlap=props.get("overlap", None),
             lod_scale=parameters.number("lod_scale", 0.5),
             balance=parameters.number("balance", 0.9),
             sigma_r=parameters.number("sigma_r", 0.005),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from math import ceil, sqrt
 from pathlib import Path
 
@@ -26,8 +27,11 @@ from .progress import progress
 #: Patches to choose from, in sample areas: each texel of the sample is in so many of them.
 REUSE = 24
 
+#: Cells up to which patches may not repeat what others show.
+APART = 2
+
 #: Of the maps that come of the same parameters; part of the keys of caches.
-VERSION = 2
+VERSION = 3
 
 #: What the owner of a texel in an overlap is called: the cell before in x, in y, or both.
 BEFORE_X, BEFORE_Y = 1, 2
@@ -207,9 +211,12 @@ def overlap_index(y, x, step_x, overlap: int):
 
 
 def check_sizes(
-    sample: tuple[int, int], output_size: int, patch_size: int, overlap: int, owner: str
-) -> None:
-    """Raise :class:`~glintbsdf.errors.ParameterError` unless patches of that size fit."""
+    sample: tuple[int, int], output_size: int, patch_size: int, overlap: int | None, owner: str
+) -> int:
+    """Raise :class:`~glintbsdf.errors.ParameterError` unless patches of that size fit.
+
+    Returns the overlap: that given, or an eighth of a patch.
+    """
     check_whole(
         patch_size,
         lambda size: 3 <= size < min(sample),
@@ -217,6 +224,8 @@ def check_sizes(
         "patch_size",
         f"≥ 3 and smaller than the sample of {sample[1]} x {sample[0]} texels",
     )
+    if overlap is None:
+        overlap = max(1, patch_size // 8)
     check_whole(
         overlap,
         lambda size: 1 <= size < patch_size / 2,
@@ -239,6 +248,7 @@ def check_sizes(
         f"smaller than the {cell} texels of the cells that {output_size} texels are divided into",
         overlap,
     )
+    return overlap
 
 
 def cell_count(output_size: int, patch_size: int, overlap: int) -> int:
@@ -250,7 +260,7 @@ def synthesise(
     sample: NormalMap,
     output_size: int = 4096,
     patch_size: int = 64,
-    overlap: int = 2,
+    overlap: int | None = None,
     balance: float = 0.9,
     tolerance: float = 1.0,
     toroidal: bool = True,
@@ -262,13 +272,14 @@ def synthesise(
     Patches are chosen from :data:`REUSE` × sample area / patch area places in the sample, drawn at
     random, or from all places where there are fewer: structures built per patch, such as those of
     :class:`~glintbsdf.pndf.Mip`, then stay small whatever the output's size. No cell shows much of
-    what its neighbours show, for the eye is quick to find what repeats side by side.
+    what cells nearby show, for the eye is quick to find what repeats side by side.
 
     Args:
         sample: the small map.
         output_size: texels of the large map along each axis, larger than a patch.
         patch_size: texels of a patch along each axis, fewer than the sample's.
-        overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2.
+        overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2. Default: an
+            eighth of a patch. (The paper has 2 texels of 64; seams of smooth maps show then.)
         balance: α of Eq. 7, in [0, 1]: 1 compares normals alone, 0 their Jacobians.
         tolerance: patches are chosen at random among those whose mean error over the overlap is at
             most this multiple of the mean error between neighbouring texels of the sample; where
@@ -279,7 +290,7 @@ def synthesise(
 
     Raises :class:`~glintbsdf.errors.ParameterError`.
     """
-    check_sizes((sample.height, sample.width), output_size, patch_size, overlap, owner)
+    overlap = check_sizes((sample.height, sample.width), output_size, patch_size, overlap, owner)
     check(0 <= balance <= 1, owner, "balance", "a number in [0, 1]", balance)
     check(0 <= tolerance < np.inf, owner, "tolerance", "a finite number ≥ 0", tolerance)
     check_whole(seed, lambda value: 0 <= value < 1 << 63, owner, "seed", "in [0, 2⁶³)")
@@ -319,61 +330,56 @@ class _Quilt:
         self.patch = np.full((self.count, self.count), -1)
         self.owner = np.zeros((size, size), np.uint8)
         self.best_only = 0
-        # Features of the first rows and columns of all patches, and of the last where they count.
-        begin, end, every = slice(overlap), slice(int(self.steps[-1]), self.side), slice(None)
-        strips = {"top": (begin, every), "left": (every, begin)}
-        if toroidal:
-            end = slice(end.start, end.start + overlap)
-            strips |= {"bottom": (end, every), "right": (every, end)}
-        self.strips = {name: _Strip(self, *part) for name, part in strips.items()}
+        self.errors = [self.mean_errors(axis) for axis in (0, 1)]
+
+    def mean_errors(self, axis: int) -> np.ndarray:
+        """How any two patches fit side by side, by their mean error (Eq. 7) over the overlap.
+
+        As an array (length, patch before, patch after): a patch is cut to one of two lengths. Of
+        what either shows there all counts, though cuts with others may take a corner away. Known
+        once for all, patches cost nothing to choose.
+        """
+        first = self.overlaps(axis, 0)
+        lengths = range(self.steps.min(), self.steps.max() + 1)
+        squares, result = (first**2).sum(axis=1), []
+        for last in (self.overlaps(axis, length) for length in lengths):
+            # |a|² − 2 a·b + |b|²
+            result.append((last**2).sum(axis=1)[:, None] - 2 * last @ first.T + squares)
+        return np.maximum(result, 0) / (self.overlap * self.side)
+
+    def overlaps(self, axis: int, start: int) -> np.ndarray:
+        """Features that patches show in an overlap that starts so far along the axis, P × all."""
+        extent = [np.arange(self.side)] * 2
+        extent[axis] = start + np.arange(self.overlap)
+        y, x = (self.origins[:, k, None] + extent[k] for k in (0, 1))
+        return self.features[y[:, :, None], x[:, None, :]].reshape(len(self.origins), -1)
 
     def fronts(self) -> list[np.ndarray]:
         """Cells in an order in which those above, to the left and above right come first.
 
-        Those of one front, all with the same 2y + x, do not depend on each other, unless there are
-        so few that a row's last cell touches the next row's first.
+        Those of one front are more than :data:`APART` cells from each other, also around the edges,
+        and do not depend on each other. Where there are few cells, they come one by one.
         """
         y, x = np.indices((self.count, self.count)).reshape(2, -1)
-        key = 2 * y + x if self.count > 3 else y * self.count + x
+        slope = APART + 1 if self.count > APART * (APART + 2) else self.count
+        key = slope * y + x
         return [np.stack((y, x), axis=1)[key == k] for k in np.unique(key)]
 
     def place(self, cells: np.ndarray, tolerance: float) -> None:
         """Steps 3 to 5: choose patches for some cells, cut them to fit, and put them in place."""
         y, x = cells.T
         rows, columns = (self.starts[v, None] + np.arange(self.side) for v in (y, x))
-        last = self.count - 1
-        fits_to = {
-            "top": y > 0,
-            "left": x > 0,
-            "bottom": self.toroidal & (y == last),
-            "right": self.toroidal & (x == last),
-        }
-        # A cell may be a texel smaller than the patch allows for: what is beyond is not placed.
-        in_rows = np.arange(self.side) < self.steps[y, None] + self.overlap
-        in_columns = np.arange(self.side) < self.steps[x, None] + self.overlap
-        if not self.toroidal:
-            in_rows &= rows < self.size
-            in_columns &= columns < self.size
-        rows, columns = rows % self.size, columns % self.size
-        window = in_rows[:, :, None] & in_columns[:, None, :]
+        # (axis, whether the other cell comes after this one): the cells that overlap there
+        sides = {(axis, False): np.flatnonzero(cells[:, axis] > 0) for axis in (0, 1)}
+        if self.toroidal:
+            last = cells == self.count - 1
+            sides |= {(axis, True): np.flatnonzero(last[:, axis]) for axis in (0, 1)}
 
-        overlaps = {}
-        counted = np.zeros_like(window)  # texels of corners count once
-        total = np.zeros((len(cells), len(self.origins)))
-        for name, strip in self.strips.items():
-            these = np.flatnonzero(fits_to[name])
-            if len(these):
-                part = (these, *strip.part)
-                source = self.source(
-                    rows[these, strip.part[0], None], columns[these, None, strip.part[1]]
-                )
-                there = self.features.reshape(-1, 6)[source]
-                overlaps[name] = these, there
-                weight = window[part] & ~counted[part]
-                counted[part] |= weight
-                total[these] += strip.total_errors(there, weight)
-        mean = total / np.maximum(counted.sum(axis=(1, 2)), 1)[:, None]
-
+        error, count = np.zeros((len(cells), len(self.origins))), np.zeros(len(cells))
+        for (axis, after), these in sides.items():
+            error[these] += self.errors_beside(cells[these], axis, after)
+            count[these] += 1
+        mean = error / np.maximum(count, 1)[:, None]
         mean[self.repeats(y, x)] = np.inf
         allowed = mean <= tolerance * self.inside_error
         none = ~allowed.any(axis=1)
@@ -383,28 +389,55 @@ class _Quilt:
             none, mean.argmin(axis=1), (allowed.cumsum(axis=1) > nth[:, None]).argmax(axis=1)
         )
 
+        # A cell may be a texel smaller than the patch allows for: what is beyond is not placed.
+        in_rows = np.arange(self.side) < self.steps[y, None] + self.overlap
+        in_columns = np.arange(self.side) < self.steps[x, None] + self.overlap
+        if not self.toroidal:
+            in_rows &= rows < self.size
+            in_columns &= columns < self.size
+        rows, columns = rows % self.size, columns % self.size
+        window = in_rows[:, :, None] & in_columns[:, None, :]
+
+        source = self.origins[chosen, 0, None] + np.arange(self.side)
+        source = source[:, :, None] * self.normals.shape[1] + self.origins[chosen, 1, None, None]
+        source = source + np.arange(self.side)
+        features = self.features.reshape(-1, 6)
         mine = window.copy()
-        for name, (these, there) in overlaps.items():
-            part = (these, *self.strips[name].part)
-            error = np.where(window[part], self.strips[name].errors(there, chosen[these]), 0)
-            mine[part] &= _on_new_side(error, name)
+        for (axis, after), these in sides.items():
+            start = int(self.steps[-1]) if after else 0
+            part = [these, slice(self.side), slice(self.side)]
+            part[1 + axis] = slice(start, start + self.overlap)
+            part = tuple(part)
+            there = self.source(rows[these, part[1], None], columns[these, None, part[2]])
+            error = ((features[there] - features[source[part]]) ** 2).sum(axis=3)
+            mine[part] &= _on_new_side(np.where(window[part], error, 0), axis, after)
         self.patch[y, x] = chosen
         code = (np.arange(self.side) >= self.steps[y, None])[:, :, None] * np.uint8(BEFORE_Y)
         code = code + (np.arange(self.side) >= self.steps[x, None])[:, None, :] * np.uint8(BEFORE_X)
         cell, i, j = np.nonzero(mine)
         self.owner[rows[cell, i], columns[cell, j]] = code[cell, i, j]
 
-    def repeats(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Which patches show much of what one of a cell's neighbours shows already: N×P.
+    def errors_beside(self, cells: np.ndarray, axis: int, after: bool) -> np.ndarray:
+        """Mean errors of all patches in cells, against what the cells before or ``after`` show."""
+        other = cells.copy()
+        other[:, axis] = (other[:, axis] + (1 if after else -1)) % self.count
+        patch = self.patch[tuple(other.T)]
+        length = self.steps[(cells if after else other)[:, axis]] - self.steps.min()
+        return self.errors[axis][length, :, patch] if after else self.errors[axis][length, patch]
 
-        Those whose place in the sample is less than half a patch off along both axes; without a
-        choice, none.
+    def repeats(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Which patches show much of what cells nearby show already: N×P.
+
+        Those whose place in the sample is less than half a patch off along both axes from that of a
+        neighbour, a quarter from those of the next cells but one, and so on to :data:`APART` cells;
+        without a choice, none.
         """
         result = np.zeros((len(y), len(self.origins)), bool)
-        for above, beside in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
+        for above, beside in product(range(-APART, APART + 1), repeat=2):
             neighbour = self.patch[(y + above) % self.count, (x + beside) % self.count]
             offset = np.abs(self.origins[neighbour][:, None] - self.origins)
-            result |= (offset < self.side / 2).all(axis=2) & (neighbour >= 0)[:, None]
+            near = (offset < self.side / 2 ** max(abs(above), abs(beside))).all(axis=2)
+            result |= near & (neighbour >= 0)[:, None]
         return result & ~result.all(axis=1, keepdims=True)
 
     def source(self, row, column) -> np.ndarray:
@@ -447,40 +480,10 @@ class _Quilt:
         )
 
 
-class _Strip:
-    """A part of a patch's window that overlaps others, and the features of all patches there."""
-
-    def __init__(self, quilt: _Quilt, rows: slice, columns: slice) -> None:
-        self.part = rows, columns
-        y, x = (np.arange(quilt.side)[part] for part in self.part)
-        self.patches = quilt.features[
-            quilt.origins[:, 0, None, None] + y[:, None], quilt.origins[:, 1, None, None] + x
-        ]
-        self.squares = (self.patches**2).sum(axis=3).reshape(len(self.patches), -1)
-
-    def total_errors(self, there: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Sum of ``weight`` |there − patch|² for N windows and all patches: N×P.
-
-        ``there``: N × rows × columns × 6; ``weight``: N × rows × columns, whether a texel counts.
-        As matrix products: |a|² − 2 a·b + |b|².
-        """
-        weight = weight.astype(np.float32)
-        weighted = (there * weight[..., None]).reshape(len(there), -1)
-        own = (weighted * there.reshape(len(there), -1)).sum(axis=1, keepdims=True)
-        product = weighted @ self.patches.reshape(len(self.patches), -1).T
-        of_patches = weight.reshape(len(there), -1) @ self.squares.T
-        return np.maximum(own - 2 * product + of_patches, 0)
-
-    def errors(self, there: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """|there − patch|² of N windows, each with its ``chosen`` patch: N × rows × columns."""
-        return ((there - self.patches[chosen]) ** 2).sum(axis=3)
-
-
-def _on_new_side(error: np.ndarray, name: str) -> np.ndarray:
-    """Which texels of a strip lie on the new patch's side of the least cut, the cut included."""
-    across = 1 if name in ("top", "bottom") else 2
-    error = np.moveaxis(error, across, 2)
+def _on_new_side(error: np.ndarray, axis: int, after: bool) -> np.ndarray:
+    """Which texels of overlaps (N × rows × columns) lie on the new patch's side of the least cut,
+    the cut included; the old patch comes ``after`` the new one along the axis, or before."""
+    error = np.moveaxis(error, 1 + axis, 2)
     path = minimum_error_cut(error)[:, :, None]
     place = np.arange(error.shape[2])
-    new = place >= path if name in ("top", "left") else place <= path
-    return np.moveaxis(new, 2, across)
+    return np.moveaxis(place <= path if after else place >= path, 2, 1 + axis)

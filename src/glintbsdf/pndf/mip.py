@@ -80,7 +80,7 @@ class Mip:
         normal_map: NormalMap,
         output_size: int = 4096,
         patch_size: int = 64,
-        overlap: int = 2,
+        overlap: int | None = None,
         clusters: int = 32,
         lod_scale: float = 0.5,
         balance: float = 0.9,
@@ -90,7 +90,7 @@ class Mip:
         owner: str = "Mip",
     ) -> None:
         sample = (normal_map.height, normal_map.width)
-        check_sizes(sample, output_size, patch_size, overlap, owner)
+        overlap = check_sizes(sample, output_size, patch_size, overlap, owner)
         check_whole(clusters, lambda k: 1 <= k <= 1024, owner, "clusters", "from 1 to 1024")
         check(0 <= lod_scale < 16, owner, "lod_scale", "a number in [0, 16)", lod_scale)
         check(0 <= normal_weight < inf, owner, "normal_weight", "a number ≥ 0", normal_weight)
