@@ -22,9 +22,9 @@ on one map; the columns, what is expected of them, and so the bounds:
   correction for the number of its tests.
 * **furnace**: the largest share of uniform light reflected, for footprints of half a texel, four
   texels and the map, from vertical to 89.9°, where the method promises not to exceed 1 (for
-  ``glint_diffuse``, whose facets count with their own area, the largest (1 + 1/m_z)/2; for tables
-  1 + ``max_error``, as their masking is that of the map). Bound: that and the error of the
-  estimate.
+  ``glint_diffuse``, whose facets count with their own area, the largest (1 + 1/m_z)/2, or what
+  Oren and Nayar's model reaches; for tables 1 + ``max_error``, as their masking is that of the
+  map). Bound: that, as much as ∫D may be off, and the error of the estimate.
 * **bright**: pictures of squares with ordinary, inverted and collapsed UV coordinates in light of
   2²⁰ and of 1, relative L1 difference. Scaling by a power of two changes no digit. Bound: 1e-5, the
   order of sums over samples.
@@ -65,6 +65,7 @@ from rich.table import Table  # noqa: E402
 import glintbsdf  # noqa: E402, F401  (registers the plugins)
 from glintbsdf import NormalMap, maps  # noqa: E402
 from glintbsdf.cli import interruptible  # noqa: E402
+from glintbsdf.pndf.manifold import equilateral  # noqa: E402
 from glintbsdf.progress import progress  # noqa: E402
 from glintbsdf.rendering import replacing  # noqa: E402
 
@@ -194,9 +195,15 @@ METHODS: dict[str, Method] = {
     ),
 }
 
-#: Parameters that are the width of a lobe of normals, and the narrowest that can be judged: float32
-#: half vectors are 6e-8 apart, and recovered from two directions with an error of about 1e-7.
-WIDTHS, NARROWEST_LOBE = ("alpha", "sigma_r"), 1e-5
+#: Widths of lobes of normals that parameters stand for (of a degenerate triangle the radius of the
+#: circle in it), and the narrowest that can be judged: float32 half vectors are 6e-8 apart, and
+#: recovered from two directions with an error of about 1e-7.
+WIDTHS: dict[str, Callable[[float], float]] = {
+    "alpha": lambda alpha: alpha,
+    "sigma_r": lambda sigma_r: sigma_r,
+    "epsilon": lambda epsilon: equilateral(epsilon)[0][1] / 2,
+}
+NARROWEST_LOBE = 1e-5
 #: Maps on which parameters are swept, and on which pictures are made; the latter is what is left
 #: of all maps in a hurry.
 SWEPT, STIFFEST = ("step edge", *NO_MAP), ("white noise", *NO_MAP)
@@ -288,7 +295,9 @@ def measure(row: Row) -> dict:
             bsdf, energy_views, (2 if row.quick else 8) * method.lanes, spread
         ),
         "energy_limit": lambda: energy_limit(row),
-        "resolved": lambda: row.parameter not in WIDTHS or row.value >= NARROWEST_LOBE,
+        "resolved": lambda: (
+            row.parameter not in WIDTHS or WIDTHS[row.parameter](row.value) >= NARROWEST_LOBE
+        ),
     }
     if method.plugin == "glint_grid":
         measured["mean"] = lambda: measures.mean_of_grid(bsdf, 1 << 16)
@@ -333,14 +342,21 @@ def promised(method: Method, views: list[measures.View]) -> list[measures.View]:
     return views
 
 
+#: The most that Oren and Nayar's model reflects of uniform light, along the horizon: A + B/2, of
+#: all roughnesses.
+OREN_NAYAR = 1.0152
+
+
 def energy_limit(row: Row) -> float:
     """The largest share of uniform light that a method may reflect."""
-    if row.method != "diffuse":
-        # Masking is that of the map, from which D may be ``max_error`` off.
-        description = METHODS[row.method].parameters | {row.parameter: row.value}
-        return 1 + description.get("max_error", 0.0)
-    normals = normal_map_of(row.map).normals.astype(np.float64)
-    return float((0.5 + 0.5 / np.sqrt(1 - (normals**2).sum(-1))).max())
+    if row.method == "diffuse":
+        normals = normal_map_of(row.map).normals.astype(np.float64)
+        return float((0.5 + 0.5 / np.sqrt(1 - (normals**2).sum(-1))).max())
+    if METHODS[row.method].parameters.get("method") == "oren_nayar":
+        return OREN_NAYAR
+    # Masking is that of the map, from which D may be ``max_error`` off.
+    description = METHODS[row.method].parameters | {row.parameter: row.value}
+    return 1 + description.get("max_error", 0.0)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -351,7 +367,6 @@ SIGNIFICANCE = 0.01
 MASS_BOUND, DOUBLE_BOUND, BRIGHT_BOUND = 1e-3, 1e-3, 1e-5
 LAST_DIGITS = 4  # of the input, that rounding may amount to
 UNRESOLVED = 0.01  # an integral of a larger error says nothing
-ROUNDING = 1e-5  # of an energy, float32
 
 
 @dataclass(frozen=True)
@@ -387,7 +402,7 @@ class Judge:
             "∫D − 1": f"≤ {MASS_BOUND:g} + {error}; error ≤ {UNRESOLVED:g}",
             "float64": f"≤ {DOUBLE_BOUND:g} + {LAST_DIGITS} last digits",
             "χ²": f"p ≥ {self.smallest_p:.2g}",
-            "furnace": f"≤ 1 + {error}",
+            "furnace": f"≤ 1 + {MASS_BOUND:g} + {error}",
             "bright": f"≤ {BRIGHT_BOUND:g}",
         }
 
@@ -439,7 +454,7 @@ class Judge:
     def furnace(self, result: dict) -> Cell:
         """The energy that is farthest beyond its error."""
         worst = max(result["energies"], key=lambda e: self.beyond(e["energy"], e["error"]))
-        kept = self.beyond(worst["energy"], worst["error"]) <= result["energy_limit"] + ROUNDING
+        kept = self.beyond(worst["energy"], worst["error"]) <= result["energy_limit"] + MASS_BOUND
         limit = result["energy_limit"]
         text = f"{worst['energy']:.3f} ± {worst['error']:.3f}"
         return Cell(text + (f" of {limit:.3g}" if limit != 1 else ""), not kept)
