@@ -29,6 +29,10 @@ FEW = 256
 #: Most queries of a batch.
 MOST = 2**18
 
+#: Seconds that a query takes at least: where queries take no longer than tracing does, noise may
+#: leave nothing of them.
+LEAST = 1e-9
+
 #: Independent sets of points, whose spread tells the noise of a bin's mean; and the mean of a
 #: sample standard deviation of so many Gaussian numbers over the true one.
 SETS, BIAS = 4, 0.9213
@@ -292,7 +296,8 @@ def times(structures: dict[Method, object], surface: Surface, radius: float, set
             works.append(partial(batch, pndf, *few))
             works.append(partial(batch, pndf, *first(counts[-1], *many)))
         taken = seconds_in_turn(works, settings.repetitions)
-        taken = np.maximum(taken[:, 1::2] - taken[:, ::2], 0) / (np.array(counts) - FEW)
+        taken = (taken[:, 1::2] - taken[:, ::2]) / (np.array(counts) - FEW)
+        taken = np.maximum(taken, LEAST)
     finally:
         dr.set_thread_count(threads)
     per_query = np.median(taken, axis=0)
