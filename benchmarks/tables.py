@@ -137,7 +137,8 @@ def main() -> None:
         built, worked = time.perf_counter() - start[0] - lists, time.process_time() - start[1]
         tables = pndf.tables
         sizes = ", ".join(f"{n / 2**20:.1f}" for n in tables.level_nbytes)
-        grains = ", ".join(f"{g:.0f}" for g in tables.grains)
+        of_kernel = [level[KERNELS.index(options.kernel)] for level in tables.grains]
+        grains = ", ".join(f"{np.mean(grain):.0f}" for grain in of_kernel)
         print(
             f"{name}: lists {exact.nbytes / 2**20:.1f} MiB, {lists:.1f} s; with tables "
             f"{pndf.nbytes / 2**20:.1f} MiB, {built:.1f} s (both: {worked:.1f} s of processors)\n"
@@ -165,7 +166,7 @@ def main() -> None:
                     "seconds_build": built,
                     "bytes": pndf.nbytes,
                     "bytes_levels": tables.level_nbytes,
-                    "grain": tables.grains[max(level, 0)],
+                    "grain": of_kernel[max(level, 0)],
                 }
             )
             if level < 0:

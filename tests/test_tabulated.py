@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import bsdf_suite as suite
 import drjit as dr
@@ -18,16 +17,19 @@ from glintbsdf.footprint import Footprint
 from glintbsdf.kernels import KERNELS
 from glintbsdf.pndf import Manifold, TabulatedManifold
 from glintbsdf.pndf.normal_tables import (
+    Bins,
+    axis_counts,
     clipped_area,
     count_near,
-    kernel_error,
     level_counts,
-    narrowing,
-    refinement,
+    pack,
+    refinements,
     shares,
     spline_integral,
-    tile_order,
+    spread_variance,
+    weights_of,
 )
+from glintbsdf.pndf.table_error import kernel_error, narrowing
 
 EPSILON = 1e-3  # so that bins resolve the clamped triangles
 
@@ -99,21 +101,90 @@ def test_shares_are_those_of_sums_of_uniform_numbers(period, count):
     assert np.abs(drawn - expected).max() < 5 * np.sqrt(expected.max() / u.shape[1])
 
 
+def function_of_node(period, finest, count, node):
+    """Mean of a node's function over every quad of an axis."""
+    if count == finest:
+        return shares(period, finest).toarray()[node]
+    places, factors = weights_of(finest, count)
+    return factors[node] @ shares(period, finest).toarray()[places[node]]
+
+
 @pytest.mark.parametrize("period, count", [(96, 12), (100, 20), (45, 9), (40, 5), (8, 3)])
 def test_coarse_splines_are_sums_of_fine_ones(period, count):
-    for (finer, _), (coarse, _) in pairwise(level_counts((count, 1))):
-        combined = refinement(finer, finer // coarse) @ shares(period, finer)
-        assert np.allclose(combined.toarray(), shares(period, coarse).toarray(), atol=1e-6)
+    for coarse in (n for n in axis_counts(count) if count % n == 0):
+        combined = [function_of_node(period, count, coarse, k) for k in range(coarse)]
+        assert np.allclose(combined, shares(period, coarse).toarray(), atol=1e-6)
 
 
-def test_levels_and_tiles():
-    assert level_counts((90, 45)) == [(90, 45), (45, 15), (15, 5), (5, 1), (1, 1)]
-    assert level_counts((1, 1)) == [(1, 1)]
+@pytest.mark.parametrize("finest", [6, 12, 42])
+def test_mixtures_of_splines(finest):
+    """Those of two thirds of the nodes add up to one, and have the mean and variance stated."""
+    period, count = 40 * finest, 2 * finest // 3
+    functions = np.array([function_of_node(period, finest, count, k) for k in range(count)])
+    assert np.allclose(functions.sum(0), 1, atol=1e-6)
+    if finest < 12:  # too short for a function that does not meet itself
+        return
+    quad = np.arange(period) + 0.5
+    for node in (1, 2):
+        function = functions[node] / functions[node].sum()
+        mean = function @ quad
+        variance = function @ quad**2 - mean**2 + 1 / 12  # that of a quad
+        assert np.isclose(mean, (node + 0.5) * 60, atol=1e-3)
+        assert np.isclose(variance, spread_variance(count, finest) * 60**2, rtol=2e-4)
+
+
+def test_counts_of_nodes():
     assert [count_near(n) for n in (0.5, 1, 7.9, 75, 127)] == [1, 1, 6, 72, 120]
-    order, slots = tile_order((6, 9))
-    assert sorted(order) == list(range(54)) and (np.diff(slots) > 0).all()
-    y, x = divmod(order, 9)
-    assert ((slots // 16 == y // 4 * 3 + x // 4) & (slots % 16 == y % 4 * 4 + x % 4)).all()
+    assert axis_counts(84) == [84, 56, 42, 28, 21, 14, 7, 7, 4, 3, 2, 1, 1, 1, 1, 1]
+    assert axis_counts(1) == [1, 1, 1, 1]
+    assert level_counts((12, 4)) == [(12, 4), (8, 4), (6, 2), (4, 1), (3, 1), (2, 1), (1, 1)]
+
+
+def test_packed_words_name_the_entries():
+    """Bit by bit, against the masses themselves; half floats have 11 digits."""
+    mass = np.random.default_rng(1).random((6, 9, 5), dtype=np.float32)
+    mass[mass < 0.7] = 0
+    words, length, entries = pack(mass.reshape(54, 5), (6, 9), (60, 90))
+    assert words.shape == (5, 6) and (length == (mass > 0).sum((0, 1))).all()
+    first = np.cumsum(length) - length
+    for y, x, k in np.argwhere(mass > 0):
+        word = int(words[k, y // 4 * 3 + x // 4])
+        bit = y % 4 * 4 + x % 4
+        assert word >> bit & 1
+        entry = entries[first[k] + (word >> 16) + (word & ((1 << bit) - 1)).bit_count()]
+        assert np.isclose(entry, 2**15 * mass[y, x, k] / 100, rtol=2**-11)
+    assert np.bitwise_count(words & 0xFFFF).sum() == len(entries)
+
+
+@pytest.mark.parametrize("count", [(12, 18), (24, 6), (1, 5)])
+def test_levels_are_made_of_finer_ones(count):
+    """Step by step, the functions of all levels are those that stand for their nodes."""
+    counts = level_counts(count)
+    periods = [8 * n for n in count]
+    of_axes = [
+        {n: np.array([function_of_node(p, c, n, k) for k in range(n)]) for n in axis_counts(c)}
+        for p, c in zip(periods, count, strict=True)
+    ]
+    levels = [np.kron(*(of_axis[n] for of_axis, n in zip(of_axes, count, strict=True)))]
+    for (nearest, matrix), level in zip(refinements(counts), counts[1:], strict=True):
+        levels.append(matrix @ levels[nearest])
+        y, x = (of_axis[n] for of_axis, n in zip(of_axes, level, strict=True))
+        assert np.allclose(levels[-1], np.kron(y, x), atol=2e-6)
+
+
+def test_normals_of_quads_over_bins(variant):
+    """Every quad's mass is one, and has the mean of its triangles to within a bin."""
+    normal_map = maps.leather(64, seed=1)
+    mesh = Manifold(normal_map, epsilon=EPSILON)
+    row, column = (v.ravel() for v in np.indices((64, 64)))
+    bins = Bins(mesh.bounds())
+    spread = bins.spread(mesh.effective_triangles, row, column)
+    assert np.allclose(spread.sum(1), 1, atol=2e-6)
+    centres = np.array(bins.normal(dr.arange(mi.UInt32, spread.shape[1]), mi.Vector2f(0.5))).T
+    mean = spread @ centres
+    triangles = mesh.effective_triangles(mi.Int(row), mi.Int(column))
+    expected = np.array(sum(a + (e1 + e2) / 3 for a, e1, e2 in triangles) / 2).T
+    assert (np.abs(mean - expected) < 0.5 * bins.size).all()
 
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror"])
@@ -181,7 +252,7 @@ def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
                 np.diff(spline_integral((np.linspace(-5, 5, 961)[:, None] - n) / spacing), axis=0)
                 for n in nodes
             ]
-            narrowed = np.sqrt(1 - narrowing(spacing, kernel))
+            narrowed = np.sqrt(1 - narrowing(spacing**2 / 4, kernel))
             smooth = splines[0] @ weights(nodes[0][:, None], nodes[1], narrowed) @ splines[1].T
             norms.append(np.abs(smooth / smooth.sum() - true).sum())
         share = np.mean(norms) / kernel_error(kernel, spacing)
@@ -189,20 +260,50 @@ def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
         assert (0.88 if kernel == "gaussian" else 0.4) < share < 1.12
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", ["isotropic", "brushed", "flakes", "leather"])
-def test_predicted_error(variant, name):
-    """It is not above the one allowed; and within a factor of two of the error that there is."""
+def test_predicted_error(variant, name, kernel):
+    """It is not above the one allowed; the error that there is is below, by less than a half."""
     normal_map = getattr(maps, name)(256, seed=1)
-    pndf = TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.05)
-    for sigma, uv in ((14, (0.3, 0.8)), (30, (0.6, 0.1))):
+    allowed = 0.05 if kernel == "gaussian" else 0.5
+    pndf = TabulatedManifold(normal_map, kernel, EPSILON, max_error=allowed)
+    ratios = []
+    for sigma, uv in ((14, (0.3, 0.8)), (30, (0.6, 0.1)), (20, (0.1, 0.4))):
         view = footprint(sigma, aspect=1.2, uv=uv, size=(256, 256))
         level = pndf.level(view).numpy().item()
         assert level >= 0
-        kernel = pndf.texel_kernel(view)
-        predicted = pndf.error(kernel, level).numpy().item()
-        assert predicted <= 0.05 < pndf.error(kernel, level + 1).numpy().item()
-        ratio = pndf.measured_error(view) / predicted
-        assert 0.6 < ratio < 1.2  # 0.72 to 1.04 was measured
+        predicted = pndf.error(pndf.texel_kernel(view), level).numpy().item()
+        assert predicted <= allowed
+        ratios.append(pndf.measured_error(view) / predicted)
+    # 0.84 to 0.98 was measured for the Gaussian, 0.5 to 0.9 for kernels with an edge.
+    assert 0.45 < np.mean(ratios) < 1
+
+
+@pytest.mark.parametrize("name", ["isotropic", "leather"])
+def test_data_with_derivatives_are_evaluated_exactly(variant, name):
+    """The tables have no derivatives with respect to the map, so they stand back."""
+    normal_map = getattr(maps, name)(48, seed=1)
+    m = mi.Vector2f(np.random.default_rng(1).normal(scale=0.1, size=(2, 60)).astype(np.float32))
+    view = footprint(12, size=(48, 48))
+    gradients = []
+    for pndf in (
+        TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.1),
+        Manifold(normal_map, epsilon=EPSILON),
+    ):
+        dr.enable_grad(pndf.data)
+        pndf.parameters_changed(["data"])
+        dr.backward(dr.sum(pndf.eval(m, view)))
+        gradients.append(pndf.data.grad.numpy())
+    largest = np.abs(gradients[0]).max()
+    assert largest > 0 and np.allclose(*gradients, rtol=1e-3, atol=1e-5 * largest)  # order of sums
+
+    tabulated = TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.1)
+    dr.enable_grad(tabulated.data)
+    tabulated.parameters_changed(["data"])
+    assert tabulated.tables is None
+    dr.disable_grad(tabulated.data)
+    tabulated.parameters_changed(["data"])
+    assert tabulated.tables is not None
 
 
 def test_small_footprints_and_clamped_maps_are_exact(variant, normal_map, pndf):

@@ -191,6 +191,14 @@ class TexelKernel:
         """Number of quads that the support's bounding box touches, on average over its place."""
         return dr.fma(2, self.reach_u, 1) * dr.fma(2, self.reach_v, 1)
 
+    def row_at(self, v):
+        """Extent (left, right) of the support at the height ``v``, all in texels from the mean."""
+        if self.kernel == "box":
+            return -self.reach_u, self.reach_u
+        z = v * self.inverse_v
+        half = self.sigma_u_given_v * dr.safe_sqrt(dr.fma(-z, z, self.reach**2))
+        return dr.fma(self.shear, v, -half), dr.fma(self.shear, v, half)
+
     def row_extent(self, top, bottom):
         """Extent (left, right) of the support within the rows [``top``, ``bottom``].
 

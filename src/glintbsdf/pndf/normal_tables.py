@@ -12,8 +12,9 @@ have an entry, and how many entries come before.
 
 from __future__ import annotations
 
-from itertools import pairwise
+import os
 from math import sqrt
+from multiprocessing.pool import ThreadPool
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -22,6 +23,8 @@ import numpy as np
 
 from ..lattice import floor_int
 from ..progress import progress
+from . import table_error
+from .table_error import grains
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -50,6 +53,12 @@ TILE = 4
 #: Entries of the map's sparse matrix of quads and bins that are held at once.
 STRIP_ENTRIES = 8e6
 
+#: Masses (nodes × bins) of the finest level that are held at once as a full array, by each thread.
+CHUNK = 1 << 19
+
+#: Threads for what NumPy and SciPy do.
+THREADS = os.cpu_count() or 1
+
 
 # ------------------------------------------------------------------------------------------------
 #  Splines
@@ -75,46 +84,106 @@ def shares(period: int, count: int) -> csr_matrix:
     return csr_matrix((share.astype(np.float32), (node % count, quad)), (count, period))
 
 
-def refinement(count: int, factor: int) -> csr_matrix:
-    """The coarse splines in terms of the fine ones: (``count`` / ``factor``, ``count``)."""
-    from scipy.sparse import csr_matrix
-
-    ones = np.ones(factor)
-    weights = np.convolve(np.convolve(ones, ones), ones) / factor**2
-    node = np.repeat(np.arange(count // factor), len(weights))
-    finer = factor * node + np.tile(np.arange(len(weights)) - (factor - 1), count // factor)
-    values = np.tile(weights.astype(np.float32), count // factor)
-    return csr_matrix((values, (node, finer % count)), (count // factor, count))
+def count_near(wanted: float) -> int:
+    """The largest number of nodes ≤ ``wanted``, at least 1, that has many divisors."""
+    many = (m << k for m in (3, 9, 15, 21) for k in range(1, 17))
+    return max((n for n in (1, 2, 3, 4, *many) if n <= wanted), default=1)
 
 
-def divisor(count: int) -> int:
-    """By how much the nodes of an axis are thinned out for the next level."""
-    return next((f for f in (2, 3, 5) if count % f == 0), 1)
+def axis_counts(count: int) -> list[int]:
+    """Nodes along an axis of levels 1, 1½, 2, 3, 4, 6, 8, … times coarser than ``count``.
+
+    All but the second divide ``count``, so that a level may be somewhat coarser than that.
+    """
+    divisors = [n for n in range(1, count + 1) if count % n == 0]
+    counts = [count, 2 * count // 3 if count % 6 == 0 else count]
+    for octave in range(1, count.bit_length() + 1):
+        for factor in (2**octave, 3 * 2 ** (octave - 1)):
+            counts.append(max((n for n in divisors if n * factor <= count), default=1))
+    return counts
 
 
 def level_counts(count: tuple[int, int]) -> list[tuple[int, int]]:
     """Nodes (y, x) of all levels, from the finest to a single one."""
-    levels = [count]
-    while max(levels[-1]) > 1:
-        levels.append(tuple(n // divisor(n) for n in levels[-1]))
-    return levels
+    axes = [axis_counts(n) for n in count]
+    longest = max(map(len, axes))
+    y, x = (axis + [1] * (longest - len(axis)) for axis in axes)
+    return sorted(set(zip(y, x, strict=True)), reverse=True)
 
 
-def count_near(wanted: float) -> int:
-    """The largest number of nodes ≤ ``wanted``, at least 1, that can be halved often enough."""
-    return max((m << k for m in (1, 3, 5, 9, 15) for k in range(17) if m << k <= wanted), default=1)
+def weights_of(finer: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The splines of ``count`` nodes as sums of those of ``finer``: ``(finer nodes, weights)``.
 
-
-def tile_order(count: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes (y, x), row by row, in the order in which they are stored, and their slots there.
-
-    Slots count 16 to a tile; tiles at the border may leave some of them empty.
+    Both (``count``, K). Where ``count`` divides ``finer``, a coarse spline is a sum of fine ones.
+    Two thirds as many nodes stand for what comes closest among positive weights that add up to one
+    for every fine spline and keep the mean: a function about as wide as the spline.
     """
-    y, x = np.indices(count)
-    tiles = -(-count[1] // TILE)
-    slot = ((y // TILE * tiles + x // TILE) * TILE + y % TILE) * TILE + x % TILE
-    order = np.argsort(slot, axis=None)
-    return order, slot.ravel()[order].astype(np.int32)
+    node = np.arange(count)[:, None]
+    if 3 * count == 2 * finer:
+        weights = np.array(TWO_THIRDS)
+        steps = np.arange(-1, 2)
+        odd = node % 2 == 1
+        place = 3 * node // 2 + np.where(odd, 1 - steps, steps)
+        return place % finer, np.broadcast_to(weights, place.shape)
+    factor = finer // count
+    ones = np.ones(factor)
+    weights = np.convolve(np.convolve(ones, ones), ones) / factor**2
+    place = factor * node + np.arange(len(weights)) - (factor - 1)
+    return place % finer, np.broadcast_to(weights, place.shape)
+
+
+#: Weights of the fine splines in a function 1½ times as wide, the nearest to its centre but one on
+#: the left, the nearest, and the one on the right (of odd nodes, mirrored).
+TWO_THIRDS = (1 / 8, 7 / 8, 1 / 2)
+
+
+def spread_variance(count: int, finest: int) -> float:
+    """Variance of the function of a node, in units of the squared distance of its level's nodes."""
+    if 3 * count == 2 * finest:
+        left, _, right = (w / 1.5 for w in TWO_THIRDS)
+        return (0.25 + left + right - (right - left) ** 2) / 1.5**2
+    return 0.25
+
+
+def variances_of(periods, count, finest) -> tuple[float, float]:
+    """Variance (y, x), texels², of the functions of the nodes of a level of ``count`` nodes."""
+    return tuple(
+        spread_variance(n, f) * (p / n) ** 2 for p, n, f in zip(periods, count, finest, strict=True)
+    )
+
+
+def mixed_levels(counts) -> list[bool]:
+    """Of all levels, whether the functions of the nodes are mixtures of finer splines."""
+    return [any(3 * n == 2 * f for n, f in zip(count, counts[0], strict=True)) for count in counts]
+
+
+def refinement(finer: int, count: int) -> csr_matrix:
+    """The functions of ``count`` nodes in terms of those of ``finer``: (``count``, ``finer``)."""
+    from scipy.sparse import csr_matrix, identity
+
+    if finer == count:
+        return identity(count, np.float32, "csr")
+    places, weights = weights_of(finer, count)
+    begin = np.arange(count + 1) * places.shape[1]
+    return csr_matrix((weights.ravel().astype(np.float32), places.ravel(), begin), (count, finer))
+
+
+def refinements(counts) -> list[tuple[int, csr_matrix]]:
+    """For all levels but the first: a finer one, and the matrix (nodes, its nodes) to sum it up."""
+    from scipy.sparse import kron
+
+    found = []
+    for level, count in enumerate(counts[1:], 1):
+
+        def fits(finer, count=count):
+            """Whether splines of this level, along both axes, are what the level is made of."""
+            axes = zip(counts[finer], count, counts[0], strict=True)
+            return all(p in (n, f) or p % n == f % p == 0 for p, n, f in axes)
+
+        nearest = max(filter(fits, range(level)))
+        y, x = (refinement(p, n) for p, n in zip(counts[nearest], count, strict=True))
+        found.append((nearest, kron(y, x, format="csr")))
+    return found
 
 
 # ------------------------------------------------------------------------------------------------
@@ -200,46 +269,56 @@ class Bins:
         """
         from scipy.sparse import csr_matrix
 
-        corners = []
-        for triangle in triangles(mi.Int(row), mi.Int(column), mi.Bool(True)):
-            vertices = self.place(triangle[0])
-            edges = [e * mi.Vector2f(*(float(1 / s) for s in self.size)) for e in triangle[1:]]
-            corners.append([vertices, *(vertices + e for e in edges)])
         # The triangles of a quad in turn.
-        stored = [dr.zeros(mi.Float, 4 * len(row)) for _ in range(3)]
-        quad = dr.arange(mi.UInt32, len(row))
-        for half, vertices in enumerate(corners):
-            for array, vertex in zip(stored, vertices, strict=True):
-                dr.scatter(array, vertex, 2 * quad + half)
+        lane = dr.arange(mi.UInt32, 2 * len(row))
+        row, column = (dr.gather(mi.Int, mi.Int(v), lane >> 1) for v in (row, column))
+        (a, *first), (b, *second) = triangles(row, column, mi.Bool(True))
+        upper = (lane & 1) == 0
+        scale = mi.Vector2f(*(float(1 / size) for size in self.size))
+        corner = self.place(dr.select(upper, a, b))
+        edges = (scale * dr.select(upper, p, q) for p, q in zip(first, second, strict=True))
+        corners = [corner, *(corner + edge for edge in edges)]
+        dr.eval(corners)
 
-        def corners_of(triangle):
-            return [dr.gather(mi.Vector2f, array, triangle) for array in stored]
-
-        a, b, c = corners_of(dr.arange(mi.UInt32, 2 * len(row)))
-        lowest, highest = (
-            dr.minimum(dr.minimum(a.y, b.y), c.y),
-            dr.maximum(dr.maximum(a.y, b.y), c.y),
+        y, bottom = (
+            dr.clip(floor_int(least(least(*(c.y for c in corners[:2])), corners[2].y)), 0, top)
+            for top in (self.rows - 1,)
+            for least in (dr.minimum, dr.maximum)
         )
-        triangle, y, first_run = runs(
-            *(dr.clip(floor_int(v), 0, self.rows - 1) for v in (lowest, highest))
-        )
-        device_y, device_triangle = mi.UInt32(y), mi.UInt32(triangle)
-        run, x, first = runs(*self.columns_of(corners_of(device_triangle), mi.Float(device_y)))
-        device_run, device_x = mi.UInt32(run), mi.UInt32(x)
-        corners = corners_of(dr.gather(mi.UInt32, device_triangle, device_run))
-        at_y = dr.gather(mi.UInt32, device_y, device_run)
-        part = clipped_area(corners, mi.Float(device_x), mi.Float(at_y)).numpy()
-        bins = (at_y * self.columns + device_x).numpy().astype(np.int32)
 
-        first = first[first_run]  # of every triangle
-        total = np.add.reduceat(part, first[:-1])
+        def add_row(y, count):
+            first, last = self.columns_of(corners, mi.Float(y))
+            return y + 1, count + mi.UInt32(last - first + 1)
+
+        _, counted = dr.while_loop(
+            (y, mi.UInt32(0)), lambda y, _: y <= bottom, add_row, label="rows of bins"
+        )
+        begin = dr.prefix_sum(counted)
+        dr.eval(begin, counted)
+        entries = int(begin[-1] + counted[-1])
+        part, bins = dr.zeros(mi.Float, entries), dr.zeros(mi.Int, entries)
+
+        def add_bin(x, last, y, place, total):
+            area = clipped_area(corners, mi.Float(x), mi.Float(y))
+            dr.scatter(part, area, place)
+            dr.scatter(bins, y * self.columns + x, place)
+            new_row = x >= last
+            y = dr.select(new_row, y + 1, y)
+            start, stop = self.columns_of(corners, mi.Float(y))
+            x, last = dr.select(new_row, start, x + 1), dr.select(new_row, stop, last)
+            return x, last, y, place + 1, total + area
+
+        state = (*self.columns_of(corners, mi.Float(y)), mi.Int(y), begin + 0, mi.Float(0))
+        total = dr.while_loop(state, lambda *state: state[2] <= bottom, add_bin, label="bins")[4]
+        dr.eval(total, part, bins)
+
+        part, total, counted, begin = (v.numpy() for v in (part, total, counted, begin))
         for lost in np.flatnonzero(total == 0):  # to rounding: triangles of next to no area
-            part[first[lost] : first[lost + 1]] = 1
-            total[lost] = first[lost + 1] - first[lost]
-        part *= np.repeat(np.float32(0.5) / total, np.diff(first))
-        matrix = csr_matrix((part, bins, first[::2]), (len(row), self.rows * self.columns))
-        matrix.eliminate_zeros()
-        return matrix
+            part[begin[lost] : begin[lost] + counted[lost]] = 1
+            total[lost] = counted[lost]
+        part *= np.repeat(np.float32(0.5) / total, counted)
+        first = np.append(begin[::2], entries).astype(np.int32)
+        return csr_matrix((part, bins.numpy(), first), (len(first) - 1, self.rows * self.columns))
 
     def columns_of(self, corners, y) -> tuple[mi.Int, mi.Int]:
         """First and last column of the bins of row ``y`` that a triangle may touch."""
@@ -259,19 +338,6 @@ class Bins:
         )
 
 
-def runs(first: mi.Int, last: mi.Int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The numbers from ``first`` to ``last`` of all runs, one run after the other.
-
-    Returns the run and the number of each, and where every run begins (one more, the end).
-    """
-    first, last = first.numpy(), last.numpy()
-    begin = np.zeros(len(first) + 1, np.int32)
-    np.cumsum(last - first + 1, out=begin[1:])
-    run = np.repeat(np.arange(len(first), dtype=np.int32), np.diff(begin))
-    number = np.arange(begin[-1], dtype=np.int32) - np.repeat(begin[:-1] - first, np.diff(begin))
-    return run, number, begin
-
-
 # ------------------------------------------------------------------------------------------------
 #  The tables
 # ------------------------------------------------------------------------------------------------
@@ -287,22 +353,26 @@ class NormalTables:
         number of entries of the bin in tiles before (16 bits);
         ``starts`` (L, F): first entry of a bin;
         ``entries``: M_k(bin) per texel² as half floats times 2¹⁵, over the area of a node;
-        ``grains`` (L): see :func:`grains`.
+        ``grains`` (L, kernels, knots): see :func:`~glintbsdf.pndf.table_error.grains`.
 
     Attributes:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
-        grains (list of float): texels, of every level.
+        grains (nested lists): texels, of every level, kernel and knot.
+        mixed (list of bools): whether the functions of the nodes are mixtures of finer splines.
+        variances (list of pairs): of the functions of the nodes of every level (y, x), texels².
         level_nbytes (list of int): memory of every level, bytes.
     """
 
     EMPTY = 0xFFFFFFFF
-    VERSION = 3
+    VERSION = 4
 
     def __init__(self, arrays: dict[str, np.ndarray], periods: tuple[int, int]) -> None:
         self.bins, self.periods = Bins(arrays["bounds"]), periods
         self.counts = [tuple(int(n) for n in count) for count in arrays["counts"]]
-        self.grains = [float(g) for g in arrays["grains"]]
+        self.grains = arrays["grains"].tolist()
+        self.mixed = mixed_levels(self.counts)
+        self.variances = [variances_of(periods, count, self.counts[0]) for count in self.counts]
         self.rows = mi.UInt32(arrays["rows"])
         filled = int((arrays["rows"] != self.EMPTY).sum())
         tiles = [filled * y * x for y, x in map(tiles_of, self.counts)]
@@ -313,6 +383,11 @@ class NormalTables:
         self.nbytes = sum(self.level_nbytes) + arrays["rows"].nbytes
         self.filled = filled
         self.count_y, self.count_x = (mi.Int(v) for v in zip(*self.counts, strict=True))
+        # In units of the squared distance of nodes.
+        self.variance_y, self.variance_x = (
+            mi.Float([spread_variance(n, axis[0]) for n in axis])
+            for axis in zip(*self.counts, strict=True)
+        )
         self.first_word = mi.UInt32(np.cumsum([0, *tiles])[:-1])
         self.words, self.starts = mi.UInt32(arrays["words"]), mi.UInt32(arrays["starts"].ravel())
         entries = arrays.pop("entries")
@@ -379,26 +454,46 @@ class NormalTables:
             while True:
                 finest = masses(periods, count, spread, per_quad, report)
                 filled = np.flatnonzero(np.bincount(finest.indices, minlength=finest.shape[1]))
-                stored = [pack(finest, periods, count, filled)]
-                if sum(array.nbytes for array in stored[0]) <= BYTES:
+                if 2 * finest.nnz + 4 * len(filled) * (np.prod(tiles_of(count)) + 1) <= BYTES:
                     break
                 count = tuple(count_near(n - 1) for n in count)
-        rows = np.full(finest.shape[1], cls.EMPTY, np.uint32)
+        counts = level_counts(count)
+        finest, coarser = without_empty_rows(finest.T.tocsr(), filled), refinements(counts)
+
+        def all_levels(bins):
+            """Masses of all levels in a few of the filled bins: (nodes, bins)."""
+            levels = [finest[bins].toarray(order="F").T]
+            for nearest, matrix in coarser:
+                levels.append(matrix @ levels[nearest])
+            return levels
+
+        def packed(first):
+            levels = zip(all_levels(slice(first, first + step)), counts, strict=True)
+            return [pack(mass, count, periods) for mass, count in levels]
+
+        step = max(1, CHUNK // int(np.prod(count)))
+        with ThreadPool(THREADS) as pool:
+            chunks = pool.map(packed, range(0, len(filled), step))
+        words, lengths, entries = (
+            [np.concatenate(level) for level in zip(*part, strict=True)]
+            for part in zip(*(zip(*chunk, strict=True) for chunk in chunks), strict=True)
+        )
+        rows = np.full(bins.rows * bins.columns, cls.EMPTY, np.uint32)
         rows[filled] = np.arange(len(filled))
-        counts, levels = level_counts(count), [finest]
-        for finer, count in pairwise(counts):
-            levels.append(coarser(levels[-1], finer))
-            stored.append(pack(levels[-1], periods, count, filled))
-        words, starts, entries = zip(*stored, strict=True)
-        first = np.cumsum([0, *(len(e) for e in entries)])[:-1]
+        ends = np.cumsum(np.concatenate(lengths))
+        some = slice(None, None, max(1, len(filled) // table_error.BINS))
+        functions = (
+            [variances_of(periods, count, counts[0]) for count in counts],
+            mixed_levels(counts),
+        )
         return {
             "bounds": np.asarray(bounds),
             "counts": np.array(counts),
             "rows": rows,
-            "words": np.concatenate(words),
-            "starts": (np.stack(starts) + first[:, None]).astype(np.uint32),
+            "words": np.concatenate([w.ravel() for w in words]),
+            "starts": (ends - np.concatenate(lengths)).astype(np.uint32).reshape(len(counts), -1),
             "entries": np.concatenate(entries),
-            "grains": np.array(grains(periods, counts, levels, spread)),
+            "grains": grains(periods, counts, *functions, all_levels(some), spread, filled[some]),
         }
 
 
@@ -460,139 +555,41 @@ def masses(periods, count, spread, per_quad: float, report) -> csr_matrix:
         row, column = (v.ravel() for v in np.meshgrid(strip, np.arange(periods[1]), indexing="ij"))
         weights = of_y[:, strip]
         touched = np.flatnonzero(np.diff(weights.indptr))
-        product = kron(weights[touched], of_x, format="csr") @ spread(row, column)
-        for k, node in enumerate(touched):
-            part = product[k * count[1] : (k + 1) * count[1]]
+        normals = spread(row, column)
+
+        def sums(node, weights=weights, normals=normals):
+            return kron(weights[node], of_x, format="csr") @ normals
+
+        with ThreadPool(THREADS) as pool:
+            products = pool.map(sums, touched)
+        for node, part in zip(touched, products, strict=True):
             before = rows_of_nodes[node]
             rows_of_nodes[node] = part if before is None else before + part
         report((done + 1) / len(strips))
     return vstack(rows_of_nodes, format="csr")
 
 
-def coarser(mass: csr_matrix, count: tuple[int, int]) -> csr_matrix:
-    """The masses of the next level from those of a level of ``count`` nodes."""
-    from scipy.sparse import kron
+def without_empty_rows(matrix: csr_matrix, filled: np.ndarray) -> csr_matrix:
+    """The rows ``filled`` of a matrix, all others being empty: a view."""
+    from scipy.sparse import csr_matrix
 
-    y, x = (refinement(n, divisor(n)) for n in count)
-    return kron(y, x, format="csr") @ mass
+    begin = np.append(matrix.indptr[filled], matrix.nnz)
+    return csr_matrix((matrix.data, matrix.indices, begin), (len(filled), matrix.shape[1]))
 
 
-def pack(mass: csr_matrix, periods, count, filled: np.ndarray):
-    """The words, first entries and entries of a level, see :class:`NormalTables`."""
-    order, slots = tile_order(count)
-    columns = mass[order].tocsc()
-    begin = columns.indptr[:-1][filled]
-    number = np.repeat(
-        np.arange(len(filled), dtype=np.int32), np.diff(np.append(begin, columns.nnz))
-    )  # of the bin of an entry
-    slot = slots[columns.indices]
-    tiles = int(np.prod(tiles_of(count)))
-    tile = number * tiles + slot // TILE**2
-    first = np.flatnonzero(np.diff(tile, prepend=-1))  # entry of every tile that has any
-    words = np.zeros(len(filled) * tiles, np.uint32)
-    words[tile[first]] = np.bitwise_or.reduceat(
-        np.uint32(1) << (slot % TILE**2).astype(np.uint32), first
-    )
-    words[tile[first]] |= (first - begin[number[first]]).astype(np.uint32) << 16
+def pack(mass: np.ndarray, count, periods) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The words (bins, tiles) of a level, its numbers of entries (bins), and its entries.
+
+    ``mass`` (nodes, bins): texels², of ``count`` (y, x) nodes. See :class:`NormalTables`.
+    """
+    tiles = tiles_of(count)
+    padding = [(0, TILE * t - n) for t, n in zip(tiles, count, strict=True)]
+    slots = np.pad(mass.reshape(*count, -1), [*padding, (0, 0)])
+    slots = slots.reshape(tiles[0], TILE, tiles[1], TILE, -1).transpose(4, 0, 2, 1, 3).ravel()
+    present = slots > 0
+    nodes = np.packbits(present, bitorder="little").view("<u2").reshape(-1, np.prod(tiles))
+    number = np.bitwise_count(nodes).astype(np.uint32)
+    after = np.cumsum(number, 1, dtype=np.uint32)
     per_node = np.float32(2**15 * np.prod(count) / np.prod(periods))
-    return words, begin, (columns.data * per_node).astype(np.float16)
-
-
-# ------------------------------------------------------------------------------------------------
-#  The error
-# ------------------------------------------------------------------------------------------------
-
-#: Variance of the kernels of unit standard deviation, which are cut off.
-VARIANCE = {
-    "gaussian": 1 - 4.5 * float(np.exp(-4.5)) / (1 - float(np.exp(-4.5))),
-    "disk": 1.5**2 / 4,
-    "box": 1.5**2 / 3,
-}
-
-
-def kernel_error(kernel: str, x):
-    """L1 norm of the difference of a kernel and its interpolation by splines.
-
-    ``x``: spacing of the nodes over the kernel's standard deviation. Fitted to the norms, averaged
-    over the nodes' places. A kernel with an edge is known there to a fraction of the spacing only,
-    and half as much is added: the errors along an edge average out less than others.
-    """
-    if kernel == "gaussian":
-        return x * (0.016 + x * x * (0.012 + 0.008 * (x * x) * (x * x)))
-    return 0.9 * x
-
-
-def grains(periods, counts, levels, spread) -> list[float]:
-    """How far apart the independent places of a map are, texels, at the scale of every level.
-
-    Under a footprint of standard deviations σ₁, σ₂, the normals in a bin come from many places,
-    whose errors average out: that of the P-NDF is, for rough maps of all kinds,
-
-        kernel_error · g / (g + √(σ₁ σ₂)).
-
-    g is taken from the errors themselves under a few footprints: those of the finest level against
-    the map, those of the others against the next finer one, which errs a tenth as much.
-    """
-    rng = np.random.default_rng(0)
-    found = []
-    for level, count in enumerate(counts):
-        if level > 0 and min(count) < 4:  # footprints as large as the map
-            found.append(found[-1])
-            continue
-        spacing = [p / n for p, n in zip(periods, count, strict=True)]
-        sigma = max(spacing) / CALIBRATED
-        errors = []
-        for mean in rng.random((6, 2)) * periods:
-            table = density_at(mean, sigma, periods, count, levels[level])
-            if level == 0:
-                truth = true_density(mean, sigma, spread)
-            else:
-                truth = density_at(mean, sigma, periods, counts[level - 1], levels[level - 1])
-            errors.append(np.abs(table - truth).sum())
-        share = min(np.mean(errors) / kernel_error("gaussian", CALIBRATED), 0.99)
-        found.append(sigma * share / (1 - share))
-    return found
-
-
-#: Spacing of the nodes over the standard deviation of the footprints of :func:`grains`.
-CALIBRATED = 1.3
-
-
-def lattice_weights(mean, sigma, spacing, variance):
-    """A round Gaussian, cut at 3σ, on a lattice: its points (y, x), and its weights, of sum 1.
-
-    The points lie at the centres of cells of ``spacing`` (y, x); ``variance`` (y, x) of the
-    Gaussian, which ``sigma`` bounds.
-    """
-    axes = [
-        np.arange(int((m - 3 * sigma) // s), int((m + 3 * sigma) // s) + 1)
-        for m, s in zip(mean, spacing, strict=True)
-    ]
-    y, x = (
-        ((points + 0.5) * s - m) ** 2 / v
-        for points, s, m, v in zip(axes, spacing, mean, variance, strict=True)
-    )
-    distance = y[:, None] + x
-    weight = np.where(distance <= 9, np.exp(-0.5 * distance), 0).ravel()
-    used = weight > 0
-    y, x = (v.ravel()[used] for v in np.meshgrid(*axes, indexing="ij"))
-    return y, x, (weight[used] / weight.sum()).astype(np.float32)
-
-
-def true_density(mean, sigma: float, spread) -> np.ndarray:
-    """Mass in every bin under a round Gaussian footprint at ``mean`` (y, x), texels."""
-    y, x, weight = lattice_weights(mean, sigma, (1, 1), (sigma**2, sigma**2))
-    return spread(y, x).T @ weight
-
-
-def density_at(mean, sigma: float, periods, count, mass: csr_matrix) -> np.ndarray:
-    """The same from the masses under the splines of a level."""
-    spacing = [p / n for p, n in zip(periods, count, strict=True)]
-    variance = [sigma**2 - narrowing(s) for s in spacing]
-    y, x, weight = lattice_weights(mean, sigma, spacing, variance)
-    return mass[(y % count[0]) * count[1] + x % count[1]].T @ weight / np.prod(spacing)
-
-
-def narrowing(spacing: float, kernel: str = "gaussian") -> float:
-    """Variance to take off a footprint against what the splines add to its kernel, texels²."""
-    return spacing**2 / 4 / VARIANCE[kernel]
+    entries = (slots[present] * per_node).astype(np.float16)
+    return nodes | (after - number) << 16, after[:, -1], entries

@@ -29,15 +29,13 @@ import numpy as np
 from ..cache import load_or_build
 from ..errors import check
 from ..hashing import pcg3d, uniform
-from ..kernels import SIGMA_MIN, TexelKernel
+from ..kernels import KERNELS, TexelKernel
 from ..lattice import floor_int
 from ..normalmap import NormalMap
 from ..reach import Reach
 from .manifold import Manifold, normal_in_quad
-from .normal_tables import MIN_SPACING, NormalTables, kernel_error, narrowing
-
-#: Largest share of a footprint's variance that the splines may add.
-MAX_NARROWING = 0.6
+from .normal_tables import MIN_SPACING, TWO_THIRDS, NormalTables
+from .table_error import MAX_NARROWING, VARIANCE, predicted, widest
 
 
 class TabulatedManifold(Manifold):
@@ -82,7 +80,8 @@ class TabulatedManifold(Manifold):
         """Make everything that depends on ``self.data``; the cache may know lists and tables."""
         super().build()
         self.tables = None
-        if self.normal_map.wrap_mode != "clamp" and self.may_use_tables():
+        differentiated = dr.grad_enabled(self.data)
+        if self.normal_map.wrap_mode != "clamp" and self.may_use_tables() and not differentiated:
             arrays = self.cached_tables(
                 lambda: NormalTables.build(self.lattice, self.effective_triangles, self.bounds())
             )
@@ -93,17 +92,15 @@ class TabulatedManifold(Manifold):
         if self.reach is None:
             return True
         closest = min(MIN_SPACING, max(self.lattice.y.quads, self.lattice.x.quads))
-        return narrowing(closest, self.kernel) <= MAX_NARROWING * self.reach.largest**2
+        return closest <= widest(self.kernel) * self.reach.largest
 
     def error(self, kernel: TexelKernel, level: int) -> mi.Float:
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
-        minor = dr.sqrt(kernel.minor_variance)
         mean = dr.sqrt(kernel.sigma_u_given_v * kernel.sigma_v)
-        spacing, grain = self.tables.spacing(level), self.tables.grains[level]
-        # Half of it comes from either axis.
-        across = kernel_error(self.kernel, spacing * dr.rcp(minor))
-        along = kernel_error(self.kernel, spacing * minor * dr.rcp(mean * mean))
-        return 0.5 * (across + along) * grain * dr.rcp(grain + mean)
+        tables = self.tables
+        nodes = tables.grains[level][KERNELS.index(self.kernel)], tables.spacing(level)
+        minor = dr.sqrt(kernel.minor_variance)
+        return predicted(self.kernel, *nodes, tables.mixed[level], minor, mean)
 
     def measured_error(self, footprint) -> float:
         """The relative L1 error under a single footprint, over all bins: a check, slow.
@@ -131,62 +128,75 @@ class TabulatedManifold(Manifold):
         """The coarsest level of nodes that keeps the error, −1 where none does."""
         kernel = self.texel_kernel(footprint)
         level = mi.Int(-1)
-        for k in range(self.tables.levels):
-            fits = narrowing(self.tables.spacing(k), self.kernel) <= (
-                MAX_NARROWING * kernel.minor_variance
-            )
-            level += dr.select(fits & (self.error(kernel, k) <= self.max_error), 1, 0)
+        for k, variances in enumerate(self.tables.variances):
+            room = max(variances) <= MAX_NARROWING * VARIANCE[self.kernel] * kernel.minor_variance
+            fits = room & (self.error(kernel, k) <= self.max_error)
+            level = dr.select(fits, k, level)
         return level
 
-    def lattice_of(self, level):
-        """Distance and number of the nodes of a level: ``(spacing, count)`` for y and for x."""
-        tables, index = self.tables, mi.UInt32(dr.maximum(level, 0))
-        counts = (dr.gather(mi.Int, n, index) for n in (tables.count_y, tables.count_x))
-        return [(p / mi.Float(n), n) for p, n in zip(tables.periods, counts, strict=True)]
+    def counts_of(self, level):
+        """Number of the nodes (``mi.Int``) of a level along y and x."""
+        index = mi.UInt32(dr.maximum(level, 0))
+        return [dr.gather(mi.Int, n, index) for n in (self.tables.count_y, self.tables.count_x)]
 
     def node_kernel(self, footprint, level) -> TexelKernel:
-        """The footprint's kernel, less the variance that the splines of a level add."""
-        (spacing_y, _), (spacing_x, _) = self.lattice_of(level)
-        added = tuple(
-            dr.select(level >= 0, -narrowing(spacing, self.kernel), SIGMA_MIN**2)
-            for spacing in (spacing_x, spacing_y)
+        """The footprint's kernel on the lattice of a level, in units of the nodes' distance.
+
+        It is narrower, by the variance that the functions of the nodes add.
+        """
+        tables = self.tables
+        nodes = [
+            mi.Float(n) / p for n, p in zip(self.counts_of(level), tables.periods, strict=True)
+        ]
+        index = mi.UInt32(dr.maximum(level, 0))
+        added = (
+            dr.select(level >= 0, dr.gather(mi.Float, v, index) * (-1 / VARIANCE[self.kernel]), 1)
+            for v in (tables.variance_x, tables.variance_y)
         )
         height, width, _ = self.data.shape
-        wrap_mode = self.normal_map.wrap_mode
-        return TexelKernel(self.kernel, footprint, height, width, wrap_mode, added)
+        per_texel = mi.Vector2f(nodes[1], nodes[0])
+        kernel = TexelKernel(
+            self.kernel,
+            footprint,
+            height * nodes[0],
+            width * nodes[1],
+            self.normal_map.wrap_mode,
+            tuple(added),
+        )
+        # Texels have their centres on the corners of quads, nodes in the middle of theirs.
+        kernel.mean -= 0.5 * per_texel
+        return kernel
 
-    def every_node(self, kernel, level, active, visit, *state):
-        """Visit all nodes of a level under a kernel, row by row.
+    def every_node(self, kernel, active, visit, *state):
+        """Visit all nodes of a level under a kernel from :meth:`node_kernel`, row by row.
 
-        ``visit(weight, y, x, active, *state)`` returns the new ``state``; the weight is k(u_k − x);
-        the node's place in the lattice, ``y``, ``x`` (``mi.Int``), does not wrap.
+        ``visit(nodes, *state)`` returns the new ``state``. Each of some nodes at a time comes as
+        ``(weight, y, x, active)``; the weight is k(u_k − x), 0 where not active; the place in the
+        lattice, ``y``, ``x`` (``mi.Int``), does not wrap.
         """
-        (spacing_y, _), (spacing_x, _) = self.lattice_of(level)
         mean = mi.Vector2f(kernel.mean)
 
-        def start(y):
+        def row(y):
             """First and last node of a row."""
-            v = dr.fma(y, spacing_y, 0.5 * spacing_y - mean.y)
-            left, right = kernel.row_extent(v, v)
-            return (
-                mi.Int(dr.ceil((mean.x + left) / spacing_x - 0.5)),
-                floor_int((mean.x + right) / spacing_x - 0.5),
-            )
+            left, right = kernel.row_at(mi.Float(y) - mean.y)
+            return mi.Int(dr.ceil(mean.x + left)), floor_int(mean.x + right)
 
-        y = mi.Int(dr.ceil((mean.y - kernel.reach_v) / spacing_y - 0.5))
-        bottom = floor_int((mean.y + kernel.reach_v) / spacing_y - 0.5)
-        x, last = start(mi.Float(y))
+        y = mi.Int(dr.ceil(mean.y - kernel.reach_v))
+        bottom = floor_int(mean.y + kernel.reach_v)
+        x, last = row(y)
 
         def body(y, x, last, active, *state):
-            inside = active & (x <= last)
-            place = mi.Vector2f(x, y) + 0.5
-            weight = kernel.value(place * mi.Vector2f(spacing_x, spacing_y) - mean)
-            weight = dr.select(inside, weight, 0)
-            state = visit(weight, y, x, inside, *state)
-            new_row = x >= last
+            # Two nodes at a time: a step takes about as long as it takes to find the next row.
+            nodes = []
+            for step in range(2):
+                inside = active & (x + step <= last)
+                weight = kernel.value(mi.Vector2f(x + step, y) - mean)
+                nodes.append((dr.select(inside, weight, 0), y, x + step, inside))
+            state = visit(nodes, *state)
+            new_row = x + 1 >= last
             y = dr.select(new_row, y + 1, y)
-            first, final = start(mi.Float(y))
-            x, last = dr.select(new_row, first, x + 1), dr.select(new_row, final, last)
+            first, final = row(y)
+            x, last = dr.select(new_row, first, x + 2), dr.select(new_row, final, last)
             return y, x, last, active & (y <= bottom), *state
 
         state = (y, x, last, mi.Bool(active) & (y <= bottom), *state)
@@ -204,14 +214,18 @@ class TabulatedManifold(Manifold):
         tables, kernel = self.tables, self.node_kernel(footprint, level)
         row, found = tables.row(m, mi.Bool(active) & (level >= 0) & (dr.squared_norm(m) < 1))
         table = tables.table(mi.UInt32(dr.maximum(level, 0)), row, found)
-        (_, count_y), (_, count_x) = self.lattice_of(level)
+        count_y, count_x = self.counts_of(level)
 
-        def add(weight, y, x, active, mass, total):
-            y, x = (wrapped(*v) for v in ((y, count_y), (x, count_x)))
-            value = tables.value(table, y, x, active & (weight > 0))
-            return dr.fma(weight, value, mass), total + weight
+        def add(nodes, mass, total):
+            # A single sum: Dr.Jit takes loops that add to a state for what they are, or not at all.
+            masses, weights = mi.Float(0), mi.Float(0)
+            for weight, y, x, active in nodes:
+                y, x = (wrapped(*v) for v in ((y, count_y), (x, count_x)))
+                masses += weight * tables.value(table, y, x, active & (weight > 0))
+                weights += weight
+            return mass + masses, total + weights
 
-        mass, total = self.every_node(kernel, level, found, add, mi.Float(0), mi.Float(0))
+        mass, total = self.every_node(kernel, found, add, mi.Float(0), mi.Float(0))
         return exact + dr.select(found & (total > 0), mass / (total * tables.bins.area), 0)
 
     def sample(
@@ -231,29 +245,38 @@ class TabulatedManifold(Manifold):
 
         # More numbers than the two given are wanted: hashed from them.
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y)]
-        randoms = [uniform(v) for stream in range(4) for v in pcg3d(*bits, mi.UInt32(stream))]
-        choice, *of_spline, l1, l2, bin_x, bin_y = randoms[:11]
+        randoms = [uniform(v) for stream in range(5) for v in pcg3d(*bits, mi.UInt32(stream))]
+        choice, *of_nodes, l1, l2, bin_x, bin_y = randoms[:13]
 
-        def pick(weight, y, x, active, total, choice, at_y, at_x):
+        def pick(nodes, total, choice, at_y, at_x):
             """Weighted reservoir of one, the random number being stretched and used again."""
-            total = total + weight
-            chance = weight / dr.select(total > 0, total, 1)
-            taken = active & (choice < chance)
-            choice = dr.select(taken, choice / chance, (choice - chance) / (1 - chance))
-            choice = dr.clip(choice, 0, 1 - 2.0**-24)
-            return total, choice, dr.select(taken, y, at_y), dr.select(taken, x, at_x)
+            for weight, y, x, active in nodes:
+                total = total + weight
+                chance = weight / dr.select(total > 0, total, 1)
+                taken = active & (choice < chance)
+                choice = dr.select(taken, choice / chance, (choice - chance) / (1 - chance))
+                choice = dr.clip(choice, 0, 1 - 2.0**-24)
+                at_y, at_x = dr.select(taken, y, at_y), dr.select(taken, x, at_x)
+            return total, choice, at_y, at_x
 
         _, _, *node = self.every_node(
-            kernel, level, active, pick, mi.Float(0), choice, mi.Int(0), mi.Int(0)
+            kernel, active, pick, mi.Float(0), choice, mi.Int(0), mi.Int(0)
         )
         quad = []
-        for (spacing, _), index, axis, u in zip(
-            self.lattice_of(level),
+        finest = self.tables.counts[0]
+        axes = zip(
+            self.counts_of(level),
             node,
             (self.lattice.y, self.lattice.x),
-            (of_spline[:3], of_spline[3:]),
+            finest,
+            (of_nodes[:4], of_nodes[4:]),
             strict=True,
-        ):
+        )
+        for count, index, axis, fine, u in axes:
+            # The function of a node is a spline, or one of some finer splines at random.
+            between = 3 * count == 2 * fine
+            index = dr.select(between, finer_node(index, u[3]), index)
+            spacing = axis.quads / mi.Float(dr.select(between, fine, count))
             # A quadratic B-spline is the distribution of a sum of three uniform numbers.
             place = (mi.Float(index) - 1 + u[0] + u[1] + u[2]) * spacing
             quad.append(axis.locate(floor_int(place))[1])
@@ -271,3 +294,10 @@ class TabulatedManifold(Manifold):
 def wrapped(index, count):
     """``index`` (``mi.Int``) modulo ``count``, as ``mi.UInt32``."""
     return mi.UInt32(index - floor_int((mi.Float(index) + 0.5) / mi.Float(count)) * count)
+
+
+def finer_node(index, u):
+    """One of the nodes that make up a node of the level two thirds as fine, see ``TWO_THIRDS``."""
+    left, nearest, _ = (weight / sum(TWO_THIRDS) for weight in TWO_THIRDS)
+    step = dr.select(u < left, -1, dr.select(u < left + nearest, 0, 1))
+    return ((3 * index) >> 1) + dr.select((index & 1) == 0, step, 1 - step)
