@@ -79,6 +79,29 @@ def test_both_ways_give_the_same_where_they_meet(variant, monkeypatch, kernel):
     assert np.allclose(together, pndf.eval(m, footprint).numpy(), rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_derivatives_of_lists_equal_those_of_the_loop_over_all_quads(variant, monkeypatch, mode):
+    normal_map = maps.isotropic(64, seed=1)
+    derivatives = {}
+    for few in (manifold.FEW_QUADS, np.inf):
+        monkeypatch.setattr(manifold, "FEW_QUADS", few)
+        pndf, sigma = Manifold(normal_map), mi.Float(0.08)
+        footprint = Footprint.isotropic(mi.Point2f(mi.Float(0.3, 0.6, 0.9), 0.7), sigma)
+        m = draw(pndf, footprint, 3)
+        dr.enable_grad(sigma)
+        footprint = Footprint.isotropic(footprint.uv, sigma)
+        density = dr.sum(pndf.eval(m, footprint))
+        if mode == "forward":
+            dr.forward(sigma)
+            derivatives[few] = dr.grad(density)[0]
+        else:
+            dr.backward(density)
+            derivatives[few] = dr.grad(sigma)[0]
+    lists, loop = derivatives.values()
+    assert loop != 0
+    assert np.isclose(lists, loop, rtol=1e-4)  # the order of the sum: 1e-6 was measured
+
+
 def test_mirroring_is_repetition_of_the_unfolded_map(variant):
     normals = noise((16, 24)).normals
     unfolded = np.concatenate([normals, normals[::-1]], axis=0)

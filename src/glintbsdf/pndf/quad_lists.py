@@ -28,7 +28,7 @@ RESOLUTION = 1024
 DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
 
 #: Memory allowed, bytes per quad, the vertices not counted.
-BYTES_PER_QUAD = 42
+BYTES_PER_QUAD = 48
 
 #: Half width (in units of projected normals) by which bounds are widened against rounding.
 MARGIN = 1e-6
@@ -287,7 +287,7 @@ class QuadLists:
         ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
     """
 
-    VERSION = 2
+    VERSION = 3
 
     def __init__(
         self, lattice: Lattice, arrays: dict[str, np.ndarray], window: Window | None = None
