@@ -24,7 +24,7 @@ from .methods import EXACT, SIGMA_R, Method, Surface
 UNCLAMPED = 1e-6
 
 #: Queries of a call that takes little more than to be traced.
-FEW = 256
+FEW = 64
 
 #: Most queries of a batch.
 MOST = 2**18
@@ -276,7 +276,7 @@ def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
 def times(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
     """Median seconds per query of every method, and how many times faster than exact it is.
 
-    One thread. All methods in turn within every repetition, after a warm-up that compiles and says
+    One thread. All methods in turn within every repetition, after a warm-up that compiles and finds
     how many queries make a batch. The time of a call with few queries, which is that of tracing, is
     taken off.
     """
@@ -287,12 +287,7 @@ def times(structures: dict[Method, object], surface: Surface, radius: float, set
     try:
         works, counts = [], []
         for pndf in structures.values():
-            traced, more = (
-                min(seconds(pndf.eval, *first(count, *many)) for _ in range(3))
-                for count in (FEW, 16 * FEW)
-            )
-            marginal = max((more - traced) / (15 * FEW), settings.batch / MOST)
-            counts.append(int(np.clip(settings.batch / marginal, 2 * FEW, MOST)) // 8 * 8)
+            counts.append(batch_size(pndf, many, settings.batch))
             works.append(partial(batch, pndf, *few))
             works.append(partial(batch, pndf, *first(counts[-1], *many)))
         taken = seconds_in_turn(works, settings.repetitions)
@@ -309,6 +304,19 @@ def times(structures: dict[Method, object], surface: Surface, radius: float, set
     return dict(zip(structures, per_query.tolist(), strict=True)), dict(
         zip(structures, ratios, strict=True)
     )
+
+
+def batch_size(pndf, many, wanted: float) -> int:
+    """How many of many queries take about ``wanted`` seconds besides tracing, from 2 ``FEW`` on."""
+    traced = min(seconds(pndf.eval, *first(FEW, *many)) for _ in range(3))  # the first one compiles
+    count = FEW
+    while True:
+        count *= 4
+        taken = seconds(pndf.eval, *first(count, *many)) - traced
+        if taken > 0.25 * wanted or count == MOST:
+            break
+    size = wanted / max(taken, LEAST) * count
+    return int(np.clip(size, 2 * FEW, MOST)) // 8 * 8
 
 
 def batch(pndf, m, footprint, repetition: int) -> mi.Float:
