@@ -116,3 +116,15 @@ class Lattice:
         upper, lower = ((i >> 1) * self.pitch + ((i & 1) << 2) for i in (row, row + 1))
         left, right = (((j >> 2) << 3) + (j & 3) for j in (column, column + 1))
         return upper + left, upper + right, lower + left, lower + right
+
+    def corner_values(self, vertices, row, column, active):
+        """The four ``mi.Vector2f`` at a stored quad's vertices, of the flat array ``vertices``.
+
+        Gathered number by number: as vectors they take a third more of a query's time on LLVM.
+        """
+        return [
+            mi.Vector2f(
+                *(dr.gather(mi.Float, vertices, 2 * mi.UInt32(i) + k, active) for k in (0, 1))
+            )
+            for i in self.corners(row, column)
+        ]
