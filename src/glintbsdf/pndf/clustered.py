@@ -41,7 +41,7 @@ from .manifold import (
     quad_density,
     triangles_of_quad,
 )
-from .quad_lists import RESOLUTION, SHIFT, Builder, NormalCells, Packed, QuadLists, walk
+from .quad_lists import RESOLUTION, SHIFT, Blocks, Builder, NormalCells, Packed, QuadLists, walk
 
 #: Rung k of the ladder has at most this share, to the power k, of the quads' number of elements.
 #: Its blocks have the side BLOCK·2^k, as its elements are 2^k wide on average; none of them is
@@ -391,7 +391,7 @@ class Ladder:
         return result | {"begin": np.stack(begin, 1).astype(np.uint32)}
 
 
-class BlocksOfElements:
+class BlocksOfElements(Blocks):
     """The elements of a cut, block by block, for :class:`~glintbsdf.pndf.quad_lists.Builder`."""
 
     def __init__(self, cut, rows: int, columns: int, shift: int, triangles) -> None:
@@ -412,7 +412,7 @@ class BlocksOfElements:
         """How many elements a block has."""
         return self.first_of(block_row, block_column, 1) - self.first_of(block_row, block_column)
 
-    def triangles(self, block_row, block_column, index, active):
+    def shapes(self, block_row, block_column, index, active):
         """Whether the ``index``-th of a block exists, and its two triangles."""
         index = self.first_of(block_row, block_column) + index
         place = unpacked(self.device_elements, index, active)

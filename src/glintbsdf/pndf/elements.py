@@ -13,6 +13,7 @@ integrates to one; and the sampler draws from exactly this density.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from math import ceil, exp, inf, pi, sqrt
 
 import drjit as dr
@@ -28,17 +29,18 @@ from ..kernels import TexelKernel
 from ..lattice import BLOCK, Lattice, floor_int
 from ..normalmap import NormalMap
 from ..reach import Reach
-from .quad_lists import QuadLists, every_quad
+from .ellipses import BlocksOfEllipses
+from .quad_lists import Builder, QuadLists, every_quad
 
 #: Of the lists; part of their name in the cache.
-VERSION = 4
+VERSION = 6
 
 #: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
 FEW_CELLS = 25
 
-#: Where an element's normals are cut, in standard deviations along its principal axes: 4.3e-4 of
-#: its mass lie outside. Only what large footprints skip: small ones sum without a cut.
-NORMAL_REACH = 3.7
+#: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
+#: what large footprints skip: small ones sum without a cut.
+NORMAL_REACH = 3.94
 
 #: Bounds of the roughness. Half vectors in float32 are 6e-8 apart: below 1e-7 there is only noise,
 #: and determinants underflow from 1e-9 on.
@@ -49,7 +51,7 @@ MAX_SEEDS = 4
 
 #: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
 #: takes half of its 1120 MB then at a step of half a texel, and a quarter of that at one texel.
-BYTES_PER_CELL = 42, 90
+BYTES_PER_CELL = 42, 96
 
 #: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
 MAX_ATTEMPTS = 128
@@ -73,6 +75,11 @@ def cut_of_sums(sigma: mi.Float, point_cut: float) -> mi.Float:
 def cut_of_lists(sigma: mi.Float) -> mi.Float:
     """ρ² of the cut where W is known in closed form: its ripple stays below 5e-4."""
     return 10 + 3.5 * dr.maximum(dr.log2(2.5 / sigma), 0)
+
+
+def mass_under_fade(cut: mi.Float) -> mi.Float:
+    """What is left of a Gaussian that fades until it is cut at ρ² = ``cut``."""
+    return 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
 
 
 class SeedAxis:
@@ -231,10 +238,9 @@ class Mixture:
         if self.lists is not None:
             listed = active & ~few & self.lists.covers(m)
             density = density + self.lists.visit(m, kernel, add, listed)
-        # Under the fade, this share of a Gaussian is left.
-        faded = 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
         gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
-        mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * faded * self.mass(kernel))
+        gaussian = gaussian * mass_under_fade(cut)
+        mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
         return density / mass
 
     def sample(
@@ -410,10 +416,7 @@ class Elements(Mixture):
 
     def corner_normals(self, row, column, active):
         """Projected normals n0…n3 around a stored quad of texels."""
-        return [
-            dr.gather(mi.Vector2f, self.vertices, mi.UInt32(index), active)
-            for index in self.texels.corners(row, column)
-        ]
+        return self.texels.corner_values(self.vertices, row, column, active)
 
     def located(self, row, column, x, y):
         """The quad of texels that holds the place (``x``, ``y``) of a stored cell, and where.
@@ -516,64 +519,45 @@ class Elements(Mixture):
     #  The lists
     # --------------------------------------------------------------------------------------------
 
-    def bounds(self, row, column, active=True):
-        """A parallelogram of projected normals that holds all elements of a stored cell.
-
-        Returns a corner and two edges (``mi.Vector2f``), along the principal axes of the mean
-        element, cut at ``NORMAL_REACH``.
-        """
+    def ellipses(self, row, column, active=True):
+        """The ellipses of projected normals in which the elements of a stored cell lie."""
         with dr.suspend_grad():
-            elements = [
-                (normal, mi.Vector2f(place) - mi.Vector2f(anchor), jacobian)
+            return tuple(
+                self.ellipse(normal, mi.Vector2f(place) - mi.Vector2f(anchor), jacobian)
                 for (normal, jacobian), place, anchor in zip(
                     self.elements(row, column, active), self.places, self.anchors, strict=True
                 )
-            ]
-            edges = [mi.Vector2f(1, 0), mi.Vector2f(0, 1)]
-            if self.curved:
-                edges[0] = principal_axis(sum(jacobian for *_, jacobian in elements))
-                edges[1] = mi.Vector2f(-edges[0].y, edges[0].x)
-            corner = mi.Vector2f(0)
-            for k, axis in enumerate(edges):
-                lower, upper = mi.Float(inf), mi.Float(-inf)
-                for normal, step, jacobian in elements:
-                    centre, variance = dr.dot(normal, axis), dr.square(self.sigma_r)
-                    if jacobian is not None:
-                        image = jacobian.T @ axis
-                        centre = centre + dr.dot(image, step)
-                        variance = dr.fma(self.variance, dr.squared_norm(image), variance)
-                    reach = NORMAL_REACH * dr.sqrt(variance)
-                    lower = dr.minimum(lower, centre - reach)
-                    upper = dr.maximum(upper, centre + reach)
-                corner = corner + lower * axis
-                edges[k] = (upper - lower) * axis
-            return corner, *edges
+            )
+
+    def ellipse(self, normal, step, jacobian):
+        """That of an element, ``step`` from its anchor: all of its normals, cut."""
+        spread = ()
+        if jacobian is not None:
+            normal = normal + jacobian @ step
+            sigma = sqrt(self.variance)
+            spread = tuple(mi.Vector2f(jacobian[0, k], jacobian[1, k]) * sigma for k in (0, 1))
+        radii = Gaussian(spread, dr.square(self.sigma_r)).root()
+        return normal, *(NORMAL_REACH * radius for radius in radii)
 
     def build_lists(self) -> dict[str, np.ndarray]:
         """The lists of cells by normal."""
-
-        def triangles(row, column, active):
-            corner, first, second = self.bounds(row, column, active)
-            return (corner, first, second), (corner + first + second, -first, -second)
-
-        lower, upper = self.extent()
+        blocks = BlocksOfEllipses(self.lattice, self.ellipses, len(self.places))
         normals = self.data.numpy().reshape(-1, 2)
-        allowed = BYTES_PER_CELL[self.seeds > 1]
-        return QuadLists.build(
-            self.lattice, triangles, normals, (lower, upper), bytes_per_quad=allowed
-        )
+        return Builder(
+            blocks, normals, self.extent(), BYTES_PER_CELL[len(self.places) > 1]
+        ).arrays()
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
-        """The rectangle (lower, upper) that holds the bounds of all cells, and a margin.
+        """The rectangle (lower, upper) that holds the ellipses of all cells, and a margin.
 
         In the margin the cells at its border are found: of a flat map, all that is beyond reach.
         """
         columns = self.lattice.x.quads
         index = dr.arange(mi.UInt32, columns * self.lattice.y.quads)
-        corner, first, second = self.bounds(index // columns, index % columns)
+        boxes = map(BlocksOfEllipses.extent, self.ellipses(index // columns, index % columns))
+        lower, upper = zip(*boxes, strict=True)
         margin = 1.5 * self.sigma_r
-        lower = corner + dr.minimum(first, 0) + dr.minimum(second, 0) - margin
-        upper = corner + dr.maximum(first, 0) + dr.maximum(second, 0) + margin
+        lower, upper = reduce(dr.minimum, lower) - margin, reduce(dr.maximum, upper) + margin
         return tuple(
             np.array([extreme(v)[0] for v in bound], np.float32)
             for extreme, bound in ((dr.min, lower), (dr.max, upper))
@@ -636,19 +620,3 @@ def check_sigma_r(owner: str, sigma_r: float) -> None:
     """Raise :class:`~glintbsdf.errors.ParameterError` for a roughness that is not allowed."""
     requirement = f"a number in [{MIN_SIGMA_R:g}, {MAX_SIGMA_R:g}]"
     check(MIN_SIGMA_R <= sigma_r <= MAX_SIGMA_R, owner, "sigma_r", requirement, sigma_r)
-
-
-def principal_axis(jacobian: mi.Matrix2f) -> mi.Vector2f:
-    """The direction of normals along which ``jacobian`` spreads positions most."""
-    rows = [mi.Vector2f(jacobian[i, 0], jacobian[i, 1]) for i in range(2)]
-    difference = 0.5 * (dr.squared_norm(rows[0]) - dr.squared_norm(rows[1]))
-    product = dr.dot(*rows)
-    radius = dr.sqrt(dr.fma(difference, difference, product * product))
-    # The eigenvector, from the row that does not cancel.
-    axis = dr.select(
-        difference >= 0,
-        mi.Vector2f(difference + radius, product),
-        mi.Vector2f(product, radius - difference),
-    )
-    length = dr.norm(axis)
-    return dr.select(length > 0, axis / dr.select(length > 0, length, 1), mi.Vector2f(1, 0))

@@ -16,10 +16,11 @@ from ..gaussian_lobes import SIGMA_H, Gaussian
 from ..lattice import BLOCK, Lattice
 from ..poisson_disk import balanced_areas, cells_for, poisson_disk
 from .elements import NORMAL_REACH, Mixture, check_sigma_r
-from .quad_lists import SHIFT, BlocksOfQuads, Builder, QuadLists, Window
+from .ellipses import BlocksOfEllipses
+from .quad_lists import SHIFT, Builder, QuadLists
 
 #: Of what is built; part of its name in the cache.
-VERSION = 1
+VERSION = 2
 
 #: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
 #: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
@@ -29,19 +30,19 @@ EVEN = 2.6
 BYTES_TO_BUILD, BYTES_OF_LISTS = 600, 42
 
 
-class BlocksOfFlakes(BlocksOfQuads):
+class BlocksOfFlakes(BlocksOfEllipses):
     """The cells that have a flake."""
 
-    def __init__(self, lattice: Lattice, triangles, occupied, count: int) -> None:
-        super().__init__(lattice, triangles, Window.whole(lattice))
+    def __init__(self, lattice: Lattice, ellipses, occupied, count: int) -> None:
+        super().__init__(lattice, ellipses, shapes_each=1)
         self.occupied = occupied
         self.mean_count = count / (self.rows * self.columns)
 
-    def triangles(self, block_row, block_column, quad, active):
-        exists, triangles = super().triangles(block_row, block_column, quad, active)
+    def shapes(self, block_row, block_column, quad, active):
+        exists, ellipses = super().shapes(block_row, block_column, quad, active)
         row = block_row * BLOCK + (quad >> SHIFT)
         column = block_column * BLOCK + (quad & (BLOCK - 1))
-        return exists & self.occupied(row, column, exists), triangles
+        return exists & self.occupied(row, column, exists), ellipses
 
 
 @dataclass
@@ -120,16 +121,14 @@ class Flakes(Mixture):
         """Make everything that depends on ``sigma_r``."""
         reach = NORMAL_REACH * self.sigma_r[0]
 
-        def triangles(row, column, active):
+        def ellipses(row, column, active):
             normal = self.flake(row, column, active)[1]
-            across, up = mi.Vector2f(2 * reach, 0), mi.Vector2f(0, 2 * reach)
-            corner = normal - mi.Vector2f(reach)
-            return (corner, across, up), (corner + across + up, -across, -up)
+            return ((normal, mi.Vector2f(reach, 0), mi.Vector2f(0, reach)),)
 
         def occupied(row, column, active):
             return dr.gather(mi.Float, self.areas, self.index(row, column), active) > 0
 
-        blocks = BlocksOfFlakes(self.lattice, triangles, occupied, self.count)
+        blocks = BlocksOfFlakes(self.lattice, ellipses, occupied, self.count)
         outer = reach + 1.5 * self.sigma_r[0]  # in the margin, the cells at its border are found
         bounds = self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
 

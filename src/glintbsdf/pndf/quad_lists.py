@@ -9,6 +9,8 @@ no tree, no stack, nothing visited that is not near in both position and normal.
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
 from typing import NamedTuple
 
 import drjit as dr
@@ -355,35 +357,49 @@ class QuadLists:
         return Builder(blocks, normals, bounds, bytes_per_quad).arrays()
 
 
-def reaches(triangle, centre, half):
-    """Whether a triangle meets a rectangle (separating axes), both given as ``mi.Vector2f``.
+class Blocks:
+    """What :class:`Builder` makes lists of: things in blocks, whose normals lie in a few shapes.
 
-    ``triangle``: first vertex and two edges; ``centre``, ``half``: centre and half extents.
-    """
-    a, e1, e2 = triangle
-    a = a - centre
-    b, c = a + e1, a + e2
-    lower, upper = dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
-    meets = dr.all((lower <= half) & (upper >= -half))
-    for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
-        normal = mi.Vector2f(-edge.y, edge.x)
-        radius = dr.dot(dr.abs(normal), half)
-        p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
-        meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
-    return meets
-
-
-class BlocksOfQuads:
-    """What :class:`Builder` makes lists of: here, the quads of a window of a lattice.
+    A shape is three ``mi.Vector2f``; here it is a triangle, a vertex and two edges.
 
     Attributes:
         rows, columns (int): blocks.
-        mean_count (float): quads in a block, on average.
+        mean_count (float): things in a block, on average.
         largest_entry (int): bounds the entries.
+        shapes_each (int): shapes of a thing.
     """
 
-    def __init__(self, lattice: Lattice, triangles, window: Window) -> None:
-        self.lattice, self.triangles_of_quad = lattice, triangles
+    shapes_each = 2
+
+    @staticmethod
+    def extent(triangle):
+        """Lower and upper corner of a shape's bounding box."""
+        a, e1, e2 = triangle
+        b, c = a + e1, a + e2
+        return dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
+
+    @staticmethod
+    def meets(triangle, centre, half):
+        """Whether a shape meets a rectangle with this centre and these half extents."""
+        a, e1, e2 = triangle
+        a = a - centre
+        b, c = a + e1, a + e2
+        lower, upper = Blocks.extent((a, e1, e2))
+        meets = dr.all((lower <= half) & (upper >= -half))
+        for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
+            normal = mi.Vector2f(-edge.y, edge.x)  # a separating axis, if there is one
+            radius = dr.dot(dr.abs(normal), half)
+            p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
+            meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
+        return meets
+
+
+class BlocksOfQuads(Blocks):
+    """The quads of a window of a lattice."""
+
+    def __init__(self, lattice: Lattice, shapes, window: Window) -> None:
+        """``shapes(row, column, active)`` returns the shapes of a stored quad."""
+        self.lattice, self.shapes_of_quad = lattice, shapes
         self.window = window
         self.rows, self.columns = window.rows.count, window.columns.count
         self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
@@ -392,12 +408,12 @@ class BlocksOfQuads:
         """How many quads a block has."""
         return BLOCK**2
 
-    def triangles(self, block_row, block_column, quad, active):
-        """Whether the ``quad``-th of a block exists, and its two triangles."""
+    def shapes(self, block_row, block_column, quad, active):
+        """Whether the ``quad``-th of a block exists, and its shapes."""
         row = self.window.rows.block(block_row) * BLOCK + (quad >> SHIFT)
         column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
         exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
-        return exists, self.triangles_of_quad(row, column, exists)
+        return exists, self.shapes_of_quad(row, column, exists)
 
     def entry(self, block_row, block_column, quad):
         """What the lists say of the ``quad``-th of a block."""
@@ -507,30 +523,17 @@ class Builder:
                 mi.Int(cells.cell_in_slab(mi.UInt32(slab), upper + MARGIN, active)),
             )
 
-        def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active):
+        def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active):
             quad = quad + 1
             active = active & (quad < count)
-            exists, triangles = blocks.triangles(block_row, block_column, quad, active)
-            first, second = (tuple(mi.Vector2f(v) for v in t) for t in triangles)
-            corners = [t[0] + e for t in (first, second) for e in (mi.Vector2f(0), t[1], t[2])]
-            lowest, highest = corners[0], corners[0]
-            for corner in corners[1:]:
-                lowest, highest = dr.minimum(lowest, corner), dr.maximum(highest, corner)
+            exists, shapes = blocks.shapes(block_row, block_column, quad, active)
+            shapes = tuple(tuple(mi.Vector2f(v) for v in shape) for shape in shapes)
+            lower, upper = zip(*(blocks.extent(shape) for shape in shapes), strict=True)
+            lowest, highest = reduce(dr.minimum, lower), reduce(dr.maximum, upper)
             slab = mi.Int(cells.slab(lowest.x - MARGIN, exists))
             last_slab = dr.select(exists, mi.Int(cells.slab(highest.x + MARGIN, exists)), -1)
             cell, last_cell = cell_range(slab, lowest.y, highest.y, exists)
-            return (
-                quad,
-                slab,
-                last_slab,
-                cell,
-                last_cell,
-                lowest.y,
-                highest.y,
-                first,
-                second,
-                active,
-            )
+            return quad, slab, last_slab, cell, last_cell, lowest.y, highest.y, shapes, active
 
         def body(*state):
             state = dr.if_stmt(
@@ -540,7 +543,7 @@ class Builder:
                 lambda *state: state,
                 label="next quad",
             )
-            quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active = state
+            quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active = state
             inside = active & (slab <= last_slab)
             s, c = mi.UInt32(slab), mi.UInt32(cell)
             x = [dr.gather(mi.Float, self.slab_edges, s + k, inside) for k in range(2)]
@@ -548,7 +551,8 @@ class Builder:
             y = [dr.gather(mi.Float, self.cell_edges, index + k, inside) for k in range(2)]
             centre = mi.Vector2f(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
             half = mi.Vector2f(0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])) + MARGIN
-            found = inside & (reaches(first, centre, half) | reaches(second, centre, half))
+            met = reduce(or_, (blocks.meets(shape, centre, half) for shape in shapes))
+            found = inside & met
             slot = dr.scatter_inc(counters, counter_of_cell(s * cells.divisions + c), found)
             if entries is not None:
                 dr.scatter(entries, blocks.entry(block_row, block_column, quad), slot, found)
@@ -559,11 +563,13 @@ class Builder:
             first_cell, final_cell = cell_range(slab, lower, upper, next_slab & (slab <= last_slab))
             cell = dr.select(next_slab, first_cell, cell)
             last_cell = dr.select(next_slab, final_cell, last_cell)
-            return (quad, slab, last_slab, cell, last_cell, lower, upper, first, second, active)
+            return quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active
 
         n = dr.width(block_row)
         none, zero = dr.zeros(mi.Int, n), dr.zeros(mi.Float, n)
-        triangle = tuple(dr.zeros(mi.Vector2f, n) for _ in range(3))
+        shapes = tuple(
+            tuple(dr.zeros(mi.Vector2f, n) for _ in range(3)) for _ in range(blocks.shapes_each)
+        )
         state = (
             dr.full(mi.UInt32, 0xFFFFFFFF, n),
             none + 0,
@@ -572,8 +578,7 @@ class Builder:
             none - 1,
             zero + 0,
             zero + 0,
-            triangle,
-            tuple(v + 0 for v in triangle),
+            shapes,
             dr.full(mi.Bool, True, n),
         )
         dr.while_loop(state, lambda *state: state[-1], body, label="scan of quads")
