@@ -78,8 +78,8 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
 
  * - sigma_r
    - |float|
-   - Intrinsic roughness: the standard deviation of a projected normal, in (0, 1].
-     (Default: 0.005)
+   - Intrinsic roughness: the standard deviation of a projected normal, in [1e-8, 1]. Half vectors
+     in single precision resolve a lobe down to 1e-7; normals are kept to 1.5e-5. (Default: 0.005)
    - |exposed|, |differentiable|
 
  * - masking

@@ -55,10 +55,10 @@ def unpacked(words: np.ndarray, extent: float) -> Lobes:
     low, high = (words & 0xFFFF).astype(np.uint16), (words >> 16).astype(np.uint16)
     halves = [[v[:, k].view(np.float16).astype(float) for v in (low, high)] for k in range(8)]
     real = halves[1][0] > 0
-    x, y, n_x, n_y = (v[:, k] / 65535 for k in (0, 4) for v in (low, high))
+    x, y, n_x, n_y = (v[:, k] / 65535 for k in (0, 2) for v in (low, high))
     mean = np.stack((extent * x, extent * y, 2 * n_x - 1, 2 * n_y - 1), axis=1)
     zero = np.zeros(len(words))
-    inverse = np.array([[halves[1][1], zero], halves[2]]).transpose(2, 0, 1)[real]
+    inverse = np.array([[halves[1][1], zero], halves[4]]).transpose(2, 0, 1)[real]
     q = np.array([[halves[3][1], zero], halves[5]]).transpose(2, 0, 1)[real]
     b = np.array([halves[6], halves[7]]).transpose(2, 0, 1)[real]
     root = np.linalg.inv(inverse)

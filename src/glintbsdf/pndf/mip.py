@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cached_property
-from math import inf, log2
+from math import inf, log2, pi
 
 import drjit as dr
 import mitsuba as mi
@@ -24,13 +24,14 @@ import numpy as np
 from ..cache import load_or_build
 from ..errors import check, check_whole
 from ..footprint import Footprint
-from ..gaussian_lobes import SIGMA_H
+from ..gaussian_lobes import SIGMA_H, lattice_mass
 from ..hashing import pcg3d, uniform
-from ..kernels import SIGMA_MIN, TexelKernel
+from ..kernels import REACH, SIGMA_MIN, TexelKernel
 from ..normalmap import NormalMap
 from ..synthesis import VERSION as MAP_VERSION
 from ..synthesis import Synthesis, check_sizes, synthesise
 from . import lobe_levels, packed_lobes
+from .elements import check_sigma_r, cut_of_lists, mass_under_fade
 from .manifold import add_where
 from .mip_grids import Grids
 from .packed_lobes import NORMAL_CUT, Lobe
@@ -41,6 +42,14 @@ WIDTH = 2.0
 
 #: A footprint more elongated than this counts as wider in Eq. 8, which limits the cost.
 MAX_ANISOTROPY = 16.0
+
+
+#: Squared distance, in standard deviations of footprint and lobe together, from which on lobes of
+#: grids count for nothing: 0.4 % of the mass.
+GRID_CUT = 12.25
+
+#: Lobes per turn of the loop, whose overhead would otherwise cost as much as a lobe.
+PER_TURN = 4
 
 
 class Mip:
@@ -58,7 +67,7 @@ class Mip:
         lod_scale (float): C_P ≥ 0 of Eq. 8, λ = C_P log₂ P with P the footprint's area in texels,
             (2σ)² for a round one. With 1/2, a level's grids are as wide as the footprint.
         sigma_r (float): intrinsic roughness, the standard deviation of normals about those of the
-            map, > 0.
+            map, in [1e-8, 1].
         normal_weight (float): weight ≥ 0 of normals against positions where lobes are clustered;
             see :class:`~glintbsdf.pndf.lobe_levels.Clustering`.
         owner (str): whom errors name, usually the plugin.
@@ -105,14 +114,9 @@ class Mip:
         }
         self.wrap_mode = normal_map.wrap_mode
         self.sigma_r = mi.Float(sigma_r)
-        self.check_sigma_r()
+        check_sigma_r(owner, sigma_r)
         self.data = mi.TensorXf(normal_map.normals)
         self.build(normal_map)
-
-    def check_sigma_r(self) -> None:
-        """Raise unless the roughness is in range."""
-        value = self.sigma_r[0]
-        check(0 < value <= 1, self.owner, "sigma_r", "a number in (0, 1]", value)
 
     def build(self, sample: NormalMap) -> None:
         """Synthesise the map and cluster its lobes; the cache on disk may know them already."""
@@ -187,11 +191,12 @@ class Mip:
         return mi.UInt32(below), mi.UInt32(above), fraction
 
     def visit(self, footprint, kernel, level, add, state: tuple, active) -> tuple:
-        """Call ``state = add(state, lobe, d, sign, active)`` for all lobes that count.
+        """Call ``state = add(state, lobe, offset, sign, active)`` for all lobes that count.
 
-        ``d`` (texels) is the footprint's centre as seen from the lobe, in the lobe's own frame,
-        whose axes a mirrored map flips: ``sign``. One flat loop: a lobe a turn. What is not summed
-        is whole numbers: Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
+        ``offset`` (texels) is the footprint's centre as seen from the origin of the lobe's
+        positions, in the frame of the lobe's copy of the map, whose axes a mirrored map flips:
+        ``sign``. One flat loop, :data:`PER_TURN` lobes a turn. What is not summed is whole numbers:
+        Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
         """
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
@@ -200,11 +205,11 @@ class Mip:
             texels = level == 0
             width, shift = (SIGMA_H + 0.5 / 3, 0.0) if mirrored else (SIGMA_H, 0.5)
             reach = self.texel_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
+            reach.cut_at(dr.select(texels, dr.sqrt(self.texel_cut(kernel)), REACH["gaussian"]))
             centre = mi.Vector2f(reach.mean) + dr.select(texels, 0.5 - shift, 0.5)
             axis = grids.axis.on(level, active)
             top = axis.locate(centre.y - reach.reach_v)
             bottom = axis.locate(centre.y + reach.reach_v)
-            extent = dr.gather(mi.Float, grids.extent, level, active)
         mean = mi.Vector2f(kernel.mean) + 0.5  # from the map's edge
 
         def next_row(y, x, right):
@@ -257,14 +262,18 @@ class Mip:
                 label="next run",
             )
             first, count, first_2, count_2, y, x, right, origin, sign = walk
-            inside = active & (y <= bottom) & (count > 0)
+            inside = active & (y <= bottom)
             axes = mi.Vector2f(sign) if mirrored else mi.Vector2f(1)
-            lobe = Lobe(self.words, first, extent, *self.seen(kernel, axes), inside)
-            d = (mean - mi.Vector2f(origin)) * axes - lobe.position
-            state = add(state, lobe, d, axes, inside)
-            count = dr.select(inside, count - 1, count)
-            origin = mi.Vector2i(dr.select(texels, origin.x + 1, origin.x), origin.y)
-            return state, (first + 1, count, first_2, count_2, y, x, right, origin, sign)
+            for k in range(PER_TURN):
+                found = inside & (count > k)
+                place = mi.Vector2i(origin.x + dr.select(texels, k, 0), origin.y)
+                offset = (mean - mi.Vector2f(place)) * axes
+                lobe = Lobe(self.words, first + k, found)
+                state = add(state, lobe, offset, axes, found)
+            taken = dr.minimum(count, PER_TURN)
+            origin = mi.Vector2i(origin.x + dr.select(texels, mi.Int(taken), 0), origin.y)
+            count = dr.select(inside, count - taken, count)
+            return state, (first + taken, count, first_2, count_2, y, x, right, origin, sign)
 
         walk = (
             *(mi.UInt32(0) for _ in range(4)),
@@ -304,21 +313,51 @@ class Mip:
         """D(m) of one level."""
         variance = dr.square(self.sigma_r)
         active = active & self.grids.may_have(m, level, NORMAL_CUT * self.sigma_r, active)
+        cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
+        summed = self.mass_is_summed(level)
 
-        def add(state, lobe, d, sign, active):
-            density, mass = state
-            weight = lobe.weight(d)
+        def add(state, lobe, offset, sign, active):
+            near = lobe.may_show(m, variance)
 
-            def contribution():
-                return weight * lobe.normals(d).eval(m, variance)
+            def added(density, mass):
+                seen = lobe.under(offset, extent, *self.seen(kernel, sign))
+                weight = seen.weight(cut)
+                density = add_where(
+                    density,
+                    near & (weight > 0),
+                    lambda: weight * seen.normals().eval(m, variance),
+                    active,
+                )
+                return density, mass + weight
 
-            reach = NORMAL_CUT**2 * dr.fma(lobe.spread, lobe.spread, variance)
-            near = (weight > 0) & (dr.squared_norm(m - lobe.mean_normal()) < reach)
-            return add_where(density, near, contribution, active), mass + weight
+            return where_needed(active & (near | summed), added, state)
 
-        state = mi.Float(0), mi.Float(0)
-        density, mass = self.visit(footprint, kernel, level, add, state, active)
+        density, mass = self.visit(
+            footprint, kernel, level, add, (mi.Float(0), mi.Float(0)), active
+        )
+        mass = dr.select(summed, mass, self.mass_of_texels(kernel))
         return dr.select(mass > 0, density / dr.select(mass > 0, mass, 1), 0)
+
+    def cut(self, kernel: TexelKernel, level: mi.UInt32) -> mi.Float:
+        """Squared distance at which lobes are cut."""
+        return dr.select(level == 0, self.texel_cut(kernel), GRID_CUT)
+
+    def texel_cut(self, kernel: TexelKernel) -> mi.Float:
+        """Squared distance at which lobes of texels are cut, so that their mass is known."""
+        return cut_of_lists(dr.sqrt(kernel.minor_variance + SIGMA_H**2))
+
+    def mass_is_summed(self, level: mi.UInt32) -> mi.Bool:
+        """Whether the mass of all lobes is to be summed. Those of texels are a lattice, whose mass
+        is known, but where a mirrored map has two at its edge, or none."""
+        return (level > 0) | (self.wrap_mode != "repeat")
+
+    def mass_of_texels(self, kernel: TexelKernel) -> mi.Float:
+        """The sum of the weights of all lobes of texels, which stand at whole numbers."""
+        first, second = self.seen(kernel, mi.Vector2f(1))[0]
+        xx = dr.fma(first.x, first.x, dr.fma(second.x, second.x, SIGMA_H**2))
+        yy = dr.fma(second.y, second.y, SIGMA_H**2)
+        mass = lattice_mass(mi.Vector2f(kernel.mean) + 0.5, xx, second.x * second.y, yy)
+        return 2 * pi * mass_under_fade(self.texel_cut(kernel)) * mass
 
     def sample(
         self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
@@ -334,16 +373,18 @@ class Mip:
         bits, name, _ = pcg3d(dr.reinterpret_array(mi.UInt32, mi.Float(sample1)), 0, 0)
         level = dr.select(uniform(bits) < fraction, above, below)
 
-        def add(state, lobe, d, sign, active):
+        cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
+
+        def add(state, lobe, offset, sign, active):
             mass, turn, index, place, side = state
-            weight = lobe.weight(d)
+            weight = lobe.under(offset, extent, *self.seen(kernel, sign)).weight(cut)
             mass = mass + weight
             chosen = uniform(pcg3d(turn, name, 0)[0]) * mass < weight
             return (
                 mass,
                 turn + 1,
                 dr.select(chosen, lobe.index, index),
-                dr.select(chosen, d, place),
+                dr.select(chosen, offset, place),
                 dr.select(chosen, sign, side),
             )
 
@@ -351,10 +392,10 @@ class Mip:
         state = self.visit(footprint, kernel, level, add, state, active)
         mass, _, index, place, side = state
         active &= mass > 0
-        extent = dr.gather(mi.Float, self.grids.extent, level, active)
-        lobe = Lobe(self.words, index, extent, *self.seen(kernel, side), active)
+        lobe = Lobe(self.words, index, active)
+        seen = lobe.under(place, extent, *self.seen(kernel, side))
         normal = mi.warp.square_to_std_normal(mi.Point2f(sample2))
-        return lobe.normals(place).sample(normal, dr.square(self.sigma_r))
+        return seen.normals().sample(normal, dr.square(self.sigma_r))
 
     def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> tuple[tuple, mi.Float]:
         """Two vectors that make up the footprint's covariance (texels²), in the frame of a copy of
@@ -373,7 +414,7 @@ class Mip:
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         """Check what has changed; a new sample makes everything anew."""
-        self.check_sigma_r()
+        check_sigma_r(self.owner, self.sigma_r[0])
         if not keys or "data" in keys:
             self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
 
@@ -392,3 +433,11 @@ class Mip:
             f"Mip[{self.synthesis}, clusters={self.clusters}, lod_scale={self.lod_scale:g}, "
             f"sigma_r={self.sigma_r[0]:g}, {self.wrap_mode}, {self.nbytes / 1e6:.1f} MB]"
         )
+
+
+def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
+    """``added(*sums)`` in the lanes that need it, in a branch; with derivatives, in all, as
+    :func:`~glintbsdf.pndf.manifold.add_where` does."""
+    if dr.grad_enabled(added(*sums)):
+        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
+    return dr.if_stmt(sums, needed, added, lambda *sums: sums)

@@ -216,8 +216,11 @@ class Grids:
         )
         place = (cells[0] * self.count + cells[1]) * self.owners_per_cell + place
         cut = active & (above | beside)
-        word = dr.gather(mi.UInt32, self.owners, place >> 4, cut)
-        owner = dr.select(cut, (word >> ((place & 15) << 1)) & 3, 0)
+        word = dr.gather(mi.UInt32, self.owners, place >> 4, cut) >> ((place & 15) << 1)
+        owner = dr.select(cut, word & 3, 0)
+        # As far as the word goes and the owner stays the same, and no further than the strip
+        alike = dr.minimum(dr.tzcnt(word ^ (owner * 0x55555555)) >> 1, 16 - (place & 15))
+        alike = dr.minimum(alike, dr.select(above, steps[1], self.overlap) - column)
         for k, bit in enumerate((BEFORE_Y, BEFORE_X)):
             before = (owner & bit) != 0
             cell = dr.select(cells[k] == 0, self.count, cells[k]) - 1
@@ -228,7 +231,7 @@ class Grids:
         patch = dr.gather(mi.UInt32, self.patch, cells[0] * self.count + cells[1], active)
         origin = dr.gather(mi.Vector2u, self.origins, patch, active)
         source = (origin.x + offsets[0]) * self.width + origin.y + offsets[1]
-        return source, dr.select(cut, 1, steps[1] - offsets[1])
+        return source, dr.select(cut, alike, steps[1] - column)
 
 
 def _packed_owners(owners: np.ndarray) -> np.ndarray:

@@ -24,18 +24,16 @@ import mitsuba as mi
 import numpy as np
 
 from ..gaussian_lobes import Gaussian
+from .elements import FADE
 from .manifold import cross
 
-#: Standard deviations of footprint and lobe together beyond which a lobe counts for nothing: 0.2 %
-#: of the mass.
-CUT = 3.5
-
-#: Standard deviations of a lobe's normals beyond which they are left out. Those that a footprint
-#: sees at the lobe's rim may have their mean 3.5 of them off: some 1e-5 of the mass is lost there.
-NORMAL_CUT = 5.5
+#: Standard deviations of a lobe's normals beyond which they are left out: 1.5e-4 of the mass at
+#: most, be it that all lobes spread normals alike in both directions, or that a footprint sees each
+#: at its rim, where its mean is as far off as the footprint is.
+NORMAL_CUT = 4.2
 
 #: Version of the format, part of the keys of caches.
-VERSION = 1
+VERSION = 2
 
 
 def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -61,9 +59,9 @@ def pack(mass: np.ndarray, mean: np.ndarray, covariance: np.ndarray, extent: flo
     0     mean position (x, y), 65535 for ``extent`` texels
     1     mass / extent², and as all that follow in half precision:
           L⁻¹_xx, in 1/texels
-    2     L⁻¹_yx, L⁻¹_yy
+    2     mean normal (x, y), 65535 for the range from −1 to 1
     3     √ trace(B Bᵀ + Q Qᵀ), the spread of the normals, and Q_xx
-    4     mean normal (x, y), 65535 for the range from −1 to 1
+    4     L⁻¹_yx, L⁻¹_yy
     5     Q_yx, Q_yy
     6, 7  B_xx, B_xy; B_yx, B_yy
     ====  =============================================================
@@ -87,9 +85,9 @@ def pack(mass: np.ndarray, mean: np.ndarray, covariance: np.ndarray, extent: flo
     numbers = (
         (fixed(mean[:, 0] / extent), fixed(mean[:, 1] / extent)),
         (half(mass / extent**2), half(inverse[:, 0, 0])),
-        (half(inverse[:, 1, 0]), half(inverse[:, 1, 1])),
-        (half(spread), half(q[:, 0, 0])),
         (fixed(0.5 + 0.5 * mean[:, 2]), fixed(0.5 + 0.5 * mean[:, 3])),
+        (half(spread), half(q[:, 0, 0])),
+        (half(inverse[:, 1, 0]), half(inverse[:, 1, 1])),
         (half(q[:, 1, 0]), half(q[:, 1, 1])),
         (half(b[:, 0, 0]), half(b[:, 0, 1])),
         (half(b[:, 1, 0]), half(b[:, 1, 1])),
@@ -99,55 +97,81 @@ def pack(mass: np.ndarray, mean: np.ndarray, covariance: np.ndarray, extent: flo
 
 
 class Lobe:
-    """One packed lobe per lane, under a footprint.
+    """One packed lobe per lane: where its normals are, which most queries need not know more of.
 
     Args:
         words (mi.UInt32): all packed lobes, flat.
         index (mi.UInt32): which one.
-        extent (mi.Float): that of :func:`pack`.
-        vectors: two ``mi.Vector2f``, whose outer products make up the footprint's covariance.
-        cross_squared (mi.Float): its determinant.
-        active (mi.Bool): which lanes have a lobe; weights are 0 in the others.
+        active (mi.Bool): which lanes have a lobe.
+
+    Attributes:
+        mean_normal (mi.Vector2f): s, the mean normal, wherever the footprint.
+        spread (mi.Float): standard deviation of the normals, the root of the covariance's trace.
     """
 
-    def __init__(self, words, index, extent, vectors, cross_squared, active) -> None:
+    def __init__(self, words, index, active) -> None:
         self.words, self.index, self.active = words, index, active
-        packed = dr.gather(mi.Vector4u, words, 2 * index, active)
-        self.position = extent * (1 / 65535) * mi.Vector2f(low(packed.x), high(packed.x))
-        self.mass, xx = halves(packed.y)
-        self.yx, yy = halves(packed.z)
+        self.packed = dr.gather(mi.Vector4u, words, 2 * index, active)
+        self.mean_normal = normal_of(self.packed.z)
+        self.spread = halves(self.packed.w)[0]
+
+    def may_show(self, m: mi.Vector2f, variance: mi.Float) -> mi.Bool:
+        """Whether ``m`` is near its normals; ``variance``: σ_r²."""
+        reach = NORMAL_CUT**2 * dr.fma(self.spread, self.spread, variance)
+        return dr.squared_norm(m - self.mean_normal) < reach
+
+    def under(self, offset, extent, vectors, cross_squared) -> SeenLobe:
+        """The lobe under a footprint.
+
+        Args:
+            offset (mi.Vector2f): its centre from the origin of the lobe's positions, texels.
+            extent (mi.Float): that of :func:`pack`.
+            vectors: two ``mi.Vector2f``, whose outer products make up its covariance.
+            cross_squared (mi.Float): the determinant of that.
+        """
+        return SeenLobe(self, offset, extent, vectors, cross_squared)
+
+
+class SeenLobe:
+    """A :class:`Lobe` under a footprint, see :meth:`Lobe.under`."""
+
+    def __init__(self, lobe: Lobe, offset, extent, vectors, cross_squared) -> None:
+        self.lobe, active = lobe, lobe.active
+        self.mass, xx = halves(lobe.packed.y)
+        self.yx, yy = halves(dr.gather(mi.UInt32, lobe.words, 8 * lobe.index + 4, active))
         # Lanes without a lobe stay finite: their derivatives would be NaN
         self.xx, self.yy = dr.select(active, xx, 1), dr.select(active, yy, 1)
-        self.spread, self.q_xx = halves(packed.w)
         self.vectors = tuple(self.scaled(v) for v in vectors)
         self.determinant = cross_squared * dr.square(self.xx * self.yy)
         first, second = self.vectors
         trace = dr.squared_norm(first) + dr.squared_norm(second)
         self.root = dr.rsqrt(1 + trace + self.determinant)  # |T|^(−1/2)
+        packed = lobe.packed.x
+        position = extent * (1 / 65535) * mi.Vector2f(low(packed), high(packed))
+        self.d = self.scaled(offset - position)
 
     def scaled(self, v: mi.Vector2f) -> mi.Vector2f:
         """L⁻¹ v."""
         return mi.Vector2f(self.xx * v.x, dr.fma(self.yx, v.x, self.yy * v.y))
 
-    def weight(self, d: mi.Vector2f) -> mi.Float:
-        """The lobe's mass under a footprint with the centre ``d``, but for a factor common to all
-        lobes of a level; 0 beyond :data:`CUT`."""
-        distance = scaled_distance(self.vectors, self.scaled(d), self.root)
+    def weight(self, cut: mi.Float) -> mi.Float:
+        """The lobe's mass under the footprint, but for a factor common to all lobes of a level.
+
+        It fades to 0 up to the squared distance ``cut``, in standard deviations of footprint and
+        lobe together.
+        """
+        distance = scaled_distance(self.vectors, self.d, self.root)
         density = self.xx * self.yy * self.root * dr.exp(-0.5 * distance)
-        seen = self.active & (distance < CUT**2)
-        return dr.select(seen, self.mass * density, 0)
+        share = dr.clip((cut - distance) * (1 / FADE), 0, 1)
+        return dr.select(self.lobe.active, self.mass * density * share, 0)
 
-    def mean_normal(self) -> mi.Vector2f:
-        """s, the mean normal, wherever the footprint."""
-        return normal_of(dr.gather(mi.UInt32, self.words, 8 * self.index + 4, self.active))
-
-    def normals(self, d: mi.Vector2f) -> SeenNormals:
-        """The normals that a footprint with the centre ``d`` sees."""
-        packed = dr.gather(mi.Vector4u, self.words, 2 * self.index + 1, self.active)
+    def normals(self) -> SeenNormals:
+        """The normals that the footprint sees."""
+        lobe, d = self.lobe, self.d
+        packed = dr.gather(mi.Vector4u, lobe.words, 2 * lobe.index + 1, lobe.active)
+        q_xx = halves(lobe.packed.w)[1]
         q_yx, q_yy = halves(packed.y)
         b = mi.Matrix2f(*halves(packed.z), *halves(packed.w))
-
-        d = self.scaled(d)
         shift = mi.Vector2f(d)  # T⁻¹ d |T|
         for v in self.vectors:
             shift = shift + mi.Vector2f(-v.y, v.x) * cross(v, d)
@@ -159,9 +183,9 @@ class Lobe:
         column = self.root * inverse * mi.Vector2f(xx, xy)
         height = dr.sqrt(self.determinant) * inverse
         return SeenNormals(
-            normal_of(packed.x) + dr.square(self.root) * (b @ shift),
+            lobe.mean_normal + dr.square(self.root) * (b @ shift),
             (b @ column, height * mi.Vector2f(b[0, 1], b[1, 1])),
-            (self.q_xx, q_yx, q_yy),
+            (q_xx, q_yx, q_yy),
         )
 
 
