@@ -59,7 +59,7 @@ class RayCone:
     def at(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> RayCone:
         """The cone where its ray, of direction ``d``, hits a surface: ``dp`` in the tangent plane.
 
-        Igehy 1999, eqs. 10-12. Where the ray grazes so closely that an offset is not finite, that
+        Igehy's (1999) transfer. Where the ray grazes so closely that an offset is not finite, that
         offset is zero.
         """
         dp_x, dp_y = (
@@ -87,8 +87,9 @@ class RayCone:
         With h the normal at which a mirror or a smooth interface of relative index ``eta`` turns d
         into d', and μ > 0 a scalar, both laws read d' = d/η + μ h. Its differential is
         dd' = dd/η + μ dh + h dμ, and |d'| = 1 gives dμ = −(d'·dd/η + μ d'·dh)/(d'·h). The normal h
-        turns along with the surface's: dh = ±dn, dn = dn_du du + dn_dv dv. This is Igehy 1999, eqs.
-        13-18, in one form; a rough lobe is treated as its mirror, then widened by :meth:`widened`.
+        turns along with the surface's: dh = ±dn, dn = dn_du du + dn_dv dv. These are Igehy's (1999)
+        reflection and refraction in one form; a rough lobe is treated as its mirror, then widened
+        by :meth:`widened`.
 
         Args:
             si: the interaction that the cone is :meth:`at`, with ``dn_du``, ``dn_dv`` filled in.

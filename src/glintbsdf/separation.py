@@ -1,8 +1,8 @@
 """Separated illumination: glints in direct light, a smooth lobe of equal roughness in all other.
 
 Light that has been scattered before arrives from many directions at once, and what glints would
-add to its reflection is noise rather than something to see (Tan et al. 2022, section 4; Yan et al.
-2016, section 5). An integrator may therefore ask glint BSDFs for their smooth counterpart:
+add to its reflection is noise rather than something to see (Tan et al. 2022, section 4). An
+integrator may therefore ask glint BSDFs for their smooth counterpart:
 
     smooth = smooth_context()
     value = bsdf.eval(smooth, si, wo)  # a BSDF of Mitsuba takes it for its ordinary context
