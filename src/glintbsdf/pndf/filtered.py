@@ -70,7 +70,7 @@ def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> Slo
     """LEAN (Olano and Baker 2010): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``.
 
     In float32 |Ω| is known to some 1e-7 of the product of both variances: where all slopes lie on
-    one slanting line, D is 0.2 % off for α = 1e-3, and 6 % for 1e-4.
+    one slanting line, lobes of α < 1e-3 are wider or narrower than they should be.
     """
     x, y, variance_u, variance_v, cross = averages
     variance_u, variance_v = positive(variance_u), positive(variance_v)
