@@ -1,19 +1,22 @@
 """Error, speed and memory of the tables behind ``max_error``, against the exact manifold P-NDF.
 
-``python benchmarks/tables.py [--max-error 0.05] [--only MAP…] [--map FILE]… [-o RESULT.json]``
+``python benchmarks/tables.py [--max-error 0.05] [--kernel gaussian] [--errors] [--only MAP…]
+[--map FILE]… [-o RESULT.json]``
 
 Six procedural maps of 1024². The error is the relative L1 difference on the tables' bins, 128 along
 each axis over the map's normals, without sampling noise: the truth spreads every triangle under the
 footprint over the bins, weighed by the kernel at its quad. It is averaged over three places; beside
 it stands the error that was predicted, by which the tables chose their level, and the quotient of
-the two. Speed is that of random queries (normals drawn from the P-NDF, as BSDF sampling does) with
+the two, of the averages and at the worst of the places. ``--errors`` leaves it at that. Speed is
+that of random queries (normals drawn from the P-NDF, as BSDF sampling does) with
 one thread, the exact lists and the tables in turn, after a warm-up that compiles; the ratio is the
 median of those of the repetitions. Tables answer enough queries that launching the kernel does not
 count: up to 32 times as many as the lists do; times are per query.
 
 Expected before measuring: errors between a half and the whole of the predicted one; with
 ``max_error`` 0.05, 40 × at r = 64 texels, 150 × at r = 128, and no growth beyond, as a query visits
-some ten to forty nodes at every size; lists and tables at r = 16, depending on the map.
+some ten to forty nodes at every size; lists and tables at r = 16, depending on the map. With levels
+1⅓ to 1½ apart: flakes 20 × at r = 64 and 60 × at r = 128.
 """
 
 from __future__ import annotations
@@ -77,16 +80,30 @@ def footprint_of(case, scale, uv) -> Footprint:
 
 
 def errors(pndf, case, scale):
-    """Mean of the predicted and of the measured error, and the level in use (−1: exact)."""
+    """Mean of the predicted and of the measured error, the worst ratio, and the level in use.
+
+    The level is −1 where the lists answer.
+    """
     predicted, measured = [], []
     for place in PLACES:
         footprint = footprint_of(case, scale, np.array(place)[:, None])
         level = pndf.level(footprint).numpy().item()
         if level < 0:
-            return 0.0, 0.0, level
+            return 0.0, 0.0, 0.0, level
         predicted.append(pndf.error(pndf.texel_kernel(footprint), level).numpy().item())
         measured.append(pndf.measured_error(footprint))
-    return float(np.mean(predicted)), float(np.mean(measured)), level
+    worst = float(np.max(np.divide(measured, predicted)))
+    return float(np.mean(predicted)), float(np.mean(measured)), worst, level
+
+
+def smallest(pndf, scale) -> float:
+    """The smallest standard deviation, texels, of round footprints that tables serve."""
+    sigma = np.geomspace(2, 200, 500)
+    du = np.zeros((2, len(sigma)))
+    du[0] = sigma / scale[0]
+    axes = (mi.Vector2f(*(mi.Float(v) for v in d)) for d in (du, du[::-1] * scale[0] / scale[1]))
+    served = pndf.level(Footprint(mi.Point2f(0.5), *axes)).numpy() >= 0
+    return float(sigma[served].min())
 
 
 def seconds(pndf, m, footprint) -> float:
@@ -116,6 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--max-error", type=float, default=0.05)
     parser.add_argument("--kernel", default="gaussian", choices=KERNELS)
+    parser.add_argument("--errors", action="store_true", help="errors only")
     parser.add_argument("--only", nargs="+", default=list(MAPS), choices=list(MAPS), help="maps")
     parser.add_argument("--map", type=Path, action="append", default=[], help="a further map")
     parser.add_argument("-o", "--output", type=Path, help="JSON file to write")
@@ -127,7 +145,8 @@ def main() -> None:
         cases[name] = functions.get(name, getattr(maps, name, None))(SIZE, seed=1, **MAPS[name])
     threads = dr.thread_count()
     results = []
-    print("map              r aspect  turn  level predicted  measured  of it   µs/query  × exact")
+    speeds = "" if options.errors else "   µs/query  × exact"
+    print(f"map              r aspect  turn  level predicted  measured  of it  worst{speeds}")
     for name, normal_map in cases.items():
         scale = np.array([normal_map.width, normal_map.height])
         start = time.perf_counter(), time.process_time()
@@ -143,14 +162,17 @@ def main() -> None:
             f"{name}: lists {exact.nbytes / 2**20:.1f} MiB, {lists:.1f} s; with tables "
             f"{pndf.nbytes / 2**20:.1f} MiB, {built:.1f} s (both: {worked:.1f} s of processors)\n"
             f"  nodes from {tables.spacing(0):.1f} texels on; levels of {sizes} MiB; "
-            f"grains of {grains} texels",
+            f"grains of {grains} texels;\n"
+            f"  round footprints from {smallest(pndf, scale):.1f} texels on",
             flush=True,
         )
         for case in FOOTPRINTS:
-            predicted, measured, level = errors(pndf, case, scale)
-            dr.set_thread_count(1)
-            *per_query, ratio = speed(exact, pndf, case, scale)
-            dr.set_thread_count(threads)
+            predicted, measured, worst, level = errors(pndf, case, scale)
+            per_query, ratio = [None, None], None
+            if not options.errors:
+                dr.set_thread_count(1)
+                *per_query, ratio = speed(exact, pndf, case, scale)
+                dr.set_thread_count(threads)
             results.append(
                 {
                     "map": name,
@@ -160,6 +182,7 @@ def main() -> None:
                     "level": level,
                     "predicted": predicted,
                     "measured": measured,
+                    "worst_ratio": worst,
                     "seconds_exact": per_query[0],
                     "seconds": per_query[1],
                     "ratio": ratio,
@@ -170,14 +193,13 @@ def main() -> None:
                 }
             )
             if level < 0:
-                found = "exact         –         –      –"
+                found = "exact         –         –      –      –"
             else:
                 found = f"{level:5} {predicted:9.2%} {measured:9.2%} {measured / predicted:6.2f}"
-            print(
-                f"{name:12} {case[0]:5} {case[1]:6} {case[2]:4}°  {found} "
-                f"{1e6 * per_query[1]:10.3f} {ratio:8.1f}",
-                flush=True,
-            )
+                found += f" {worst:6.2f}"
+            if ratio is not None:
+                found += f" {1e6 * per_query[1]:10.3f} {ratio:8.1f}"
+            print(f"{name:12} {case[0]:5} {case[1]:6} {case[2]:4}°  {found}", flush=True)
     if options.output:
         options.output.write_text(json.dumps(results, indent=1) + "\n")
 

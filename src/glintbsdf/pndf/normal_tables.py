@@ -4,7 +4,9 @@ The nodes of a level are P/n texels apart along an axis of period P, at (k + ½)
 for the texels under a quadratic B-spline of that spacing, three spacings wide; the splines of all
 nodes add up to one. For every node, a table tells how the mass under its spline spreads over a
 grid of bins in the plane of projected normals, M_k(bin). As a spline is a sum of splines f times
-finer, for any whole f, the tables of the coarse levels are sums of those of the finest.
+finer, for any whole f, the tables of the coarse levels are sums of those of the finest. Between the
+finest level and the one twice as coarse stands another, 1½ times as coarse, whose nodes have
+mixtures of the finest splines in place of splines of their own.
 
 Most of a table is zero, at rare normals above all. Per bin, 4×4 nodes share one word: which of them
 have an entry, and how many entries come before.
@@ -35,7 +37,7 @@ BINS = 128
 #: Smallest bins, in units of projected normals: what no light resolves (half the sun's radius).
 MIN_BIN = 1e-3
 
-#: Memory allowed for the finest level, bytes. Every further level takes a quarter or a little more.
+#: Memory allowed for the finest level, bytes. All levels together take up to 3 times as much.
 BYTES = 64 << 20
 
 #: Share of it that is planned for: the need is estimated from a sample, up to 15 % too low.

@@ -1,23 +1,21 @@
 """The manifold's P-NDF at a cost that does not grow with the footprint, to an error of choice.
 
 For large footprints the map is condensed to a lattice of nodes, B texels apart. Node k stands for
-the texels around it, weighed by a quadratic B-spline; the splines of all nodes add up to one. For
-every node a table tells how the mass under its spline spreads over a grid of bins in the plane of
-projected normals, M_k(bin) (:mod:`~glintbsdf.pndf.normal_tables`). Interpolating the footprint's
-kernel between the nodes gives
+the texels around it, weighed by a function φ_k, a quadratic B-spline or nearly so; the functions of
+all nodes add up to one. For every node a table tells how the mass under its function spreads over a
+grid of bins in the plane of projected normals, M_k(bin) (:mod:`~glintbsdf.pndf.normal_tables`).
+Interpolating the footprint's kernel between the nodes gives
 
     D(m) = Σ_k k(u_k − x) M_k(bin of m) / (B² Σ_k k(u_k − x) · area of a bin).
 
-A sample takes a node with probability ∝ k(u_k − x), a place under its spline, the normal there, and
+A sample takes a node with probability ∝ k(u_k − x), a place with density φ_k, the normal there, and
 a place in that normal's bin: exactly this density, with no tables but M.
 
-*The error.* A spline widens the kernel by the variance B²/4 per axis, which is taken off the
-footprint's covariance beforehand; what is left is the difference of two kernels of equal mass, mean
-and covariance. Its L1 norm bounds the relative L1 error of the P-NDF on bins as fine as the tables'
-or coarser, whatever the map. The error itself is smaller, the more so the more independent places
-of the map fall into a bin; how far apart these are is measured when the tables are built
-(:func:`~glintbsdf.pndf.normal_tables.grains`). A footprint uses the coarsest level whose error,
-predicted from the two, is allowed.
+*The error.* φ_k widens the kernel by its own variance, B²/4 per axis for a spline, which is taken
+off the footprint's covariance beforehand; what is left is the difference of two kernels of equal
+mass, mean and covariance. How much of it shows depends on the map, and is measured when the tables
+are built (:mod:`~glintbsdf.pndf.table_error`). Levels have nodes 1⅓ to 1½ times as far apart as the
+one before, and a footprint uses the coarsest level whose predicted error is allowed.
 """
 
 from __future__ import annotations
@@ -44,14 +42,16 @@ class TabulatedManifold(Manifold):
     Args:
         max_error (float): relative L1 error of the P-NDF allowed, > 0, on the bins of the tables:
             1/128 of the range of the map's normals. The error predicted stays below; the one
-            measured is 0.7 to 1.2 of it (``benchmarks/tables.py``), and up to 1.5 for kernels with
-            an edge. Footprints so small that it would be larger are evaluated exactly.
+            measured, averaged over three places, is 0.63 to 0.96 of it on six kinds of maps, 0.55
+            to 0.95 for kernels with an edge, up to 1.2 at a single place (``benchmarks/tables.py
+            --errors``). Footprints so small that it would be larger are evaluated exactly.
         reach: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
-    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. The tables carry derivatives
-    with respect to the footprint, none with respect to the map, on which they depend through areas
-    of triangles clipped to bins. From exact to tables, and from level to level, densities change by
-    less than ``max_error`` at a size of the footprint: there is no blending, which would cost both.
+    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly, and so is one whose data carry
+    derivatives: the tables have some with respect to the footprint, but none with respect to the
+    map, on which they depend through areas of triangles clipped to bins. From exact to tables, and
+    from level to level, densities change by less than ``max_error`` at a size of the footprint:
+    there is no blending, which would cost both.
     """
 
     def __init__(
