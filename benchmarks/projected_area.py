@@ -14,8 +14,8 @@ standard error is printed beside it. Expected: relative errors below 1e-3 plus t
 
 ``furnace``: what the facets reflect of uniform light, by stratified points of the footprint, with
 the masking of each estimate of P, height-correlated or separable: the largest energy of random
-places and directions, less three standard errors, and the share above 1.002. Expected: 1 but for
-jumps of normals from texel to texel, 1.02 there.
+places and directions, less three standard errors, and the share above 1.002. Expected: 1. Measured:
+1.0015, of grooves seen through a hundredth of a texel.
 
 ``masking`` (Fig. 12): renders of the curved patch with each masking, their error against the
 analytic one, and their time as a ratio to that without masking. Expected: the fit within 1 %, at
@@ -30,7 +30,8 @@ with their own area here.
 aliasing. Error at few samples per pixel against many, of ``diffuse`` in ``normalmap`` and of
 ``glint_diffuse``. The reference of ``glint_diffuse`` is its own with footprints of points, as it
 converges to facets that count with their own area. Expected: a tenth of the aliasing at 1 sample
-per pixel.
+per pixel. Measured, relative to the mean: 0.067 against 0.49 where a pixel sees 25 texels; 0.21
+against 0.40 where it sees 6, the width of a bump.
 
 Pictures go to FOLDER: rows and columns as printed.
 """

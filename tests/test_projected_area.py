@@ -408,8 +408,7 @@ def glints(normal_map: NormalMap, **parameters) -> mi.BSDF:
 @pytest.mark.parametrize("name", MASKING_MAPS)
 def test_furnace(variant, name):
     # No footprint reflects more than it receives, at any angle: where P is not below the area of
-    # the facets themselves. Worst of 2000 views of each kind, measured: 1.000 but for maps whose
-    # normals jump, where both take a mean over points: 1.02, at grazing angles, one view in 500.
+    # the facets themselves. Worst of 1000 views of each kind, measured: 1.0015, of the brushed map.
     rng = np.random.default_rng(8)
     count, side = 120, 24
     z = np.where(rng.random(count) < 0.3, rng.random(count), 10 ** rng.uniform(-4, 0, count))
@@ -427,7 +426,7 @@ def test_furnace(variant, name):
             _, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(u))
             weight = np.array(weight)[0].reshape(count, -1)
             error = weight.std(axis=1) / side
-            assert (weight.mean(axis=1) <= 1.02 + 3 * error).all()
+            assert (weight.mean(axis=1) <= 1.002 + 3 * error).all()
 
 
 def together(views: list[View], lanes: int) -> mi.SurfaceInteraction3f:
