@@ -17,7 +17,10 @@ Expected before measuring: separate costs 1.3 times where glints are cheap (two 
 first bounce, one ray more), and less than off where wide footprints are dear; its indirect light
 has half of the error; denoising leaves a quarter of that. Measured, ``--size 90 --reference 24``:
 0.46 and 0.76 times the time; no less error, for it is that of light which diffuse walls gather from
-the balls; denoising halves the error of indirect light.
+the balls. Denoising halves the error of indirect light, as measured: few paths that are very bright
+make most of the noise, 1 % of the pixels 59 % of it, and the limit has more of that than is left in
+a denoised image. Nor is it for the guides: with none of them, with both prefiltered and declared
+clean, or without the flag for high dynamic range, the error is 1 to 3 % larger.
 """
 
 from __future__ import annotations
@@ -100,6 +103,7 @@ def measure(parameters: dict[str, str], spp: int, count: int) -> dict[str, float
         "error_denoised": error(on[few, 0] + filtered, reference_on, level),
         "error_indirect": error(on[:, 1], indirect, level),
         "error_indirect_denoised": error(filtered, indirect, level),
+        "noise_of_indirect": error(on[::2, 1].mean(axis=0), on[1::2, 1].mean(axis=0), level) / 2,
         "mean_off": float(level),
         "mean_on": float(reference_on.mean()),
         "difference_of_limits": error(reference_on, reference_off, level),
@@ -127,7 +131,7 @@ def main() -> None:
             f"  error of the image: off {r['error_off']:.3f}, on {r['error_on']:.3f}, denoised "
             f"{r['error_denoised']:.3f}\n"
             f"  error of indirect light: {r['error_indirect']:.3f}, denoised "
-            f"{r['error_indirect_denoised']:.3f}\n"
+            f"{r['error_indirect_denoised']:.3f}; noise of its limit {r['noise_of_indirect']:.3f}\n"
             f"  means: off {r['mean_off']:.4f}, on {r['mean_on']:.4f}; the limits differ by "
             f"{r['difference_of_limits']:.3f}, of which noise {r['noise_of_limits']:.3f}",
             flush=True,
