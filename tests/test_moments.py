@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from glintbsdf import Footprint, NormalMap, maps, moments
-from glintbsdf.pndf.filtered import covariance, slope
+from glintbsdf.pndf.filtered import COVARIANCE, slope
 from glintbsdf.truth import refined, wrapped
 
 SIZE = (48, 60)
@@ -22,7 +22,7 @@ MAPS = {
 def pyramid(normal_map: NormalMap, **options) -> moments.MomentPyramid:
     """LEAN's: slopes, and their covariance."""
     data = mi.TensorXf(normal_map.normals)
-    return moments.MomentPyramid(data, normal_map.wrap_mode, slope, spread=covariance, **options)
+    return moments.MomentPyramid(data, normal_map.wrap_mode, slope, spread=COVARIANCE, **options)
 
 
 def averages(chain: moments.MomentPyramid, uv, axes) -> np.ndarray:
@@ -196,7 +196,7 @@ def test_no_anisotropy_widens_to_the_major_axis(variant):
 def test_derivatives_reach_the_map(variant):
     data = mi.TensorXf(MAPS["isotropic"].normals)
     dr.enable_grad(data)
-    chain = moments.MomentPyramid(data, "repeat", slope, spread=covariance)
+    chain = moments.MomentPyramid(data, "repeat", slope, spread=COVARIANCE)
     footprint = Footprint(mi.Point2f(0.3, 0.4), mi.Vector2f(0.05, 0.02), mi.Vector2f(0, 0.03))
     dr.backward(chain.average(footprint)[2])
     gradient = dr.grad(data).numpy()

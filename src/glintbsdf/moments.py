@@ -88,32 +88,38 @@ def level_below(variance):
 # A variance that is the difference of two averages, E[x²] − E[x]², has lost the digits in which
 # both agree. So what is kept are means, and then products of deviations from them; whoever averages
 # such records takes all of them about one origin, one of the means, first (Chan, Golub and LeVeque,
-# "Algorithms for Computing the Sample Variance", The American Statistician 1983). ``spread`` makes
-# the products of deviations; without it there are only means, and nothing to do.
+# "Algorithms for Computing the Sample Variance", The American Statistician 1983).
+
+#: For each product that is kept, the pairs of means whose deviations are multiplied and summed.
+Spread = tuple[tuple[tuple[int, int], ...], ...]
 
 
-def origin_of(values: list, spread: Callable | None) -> list:
+def origin_of(record: list, spread: Spread) -> list:
     """The means of a record, for an origin; it is a constant, on which no average depends."""
-    return [] if spread is None else dr.detach(values[: len(values) - len(spread(values))])
+    return dr.detach(record[: len(record) - len(spread)]) if spread else []
 
 
-def about(origin: list, values: list, spread: Callable | None) -> list:
+def about(origin: list, record: list, spread: Spread) -> list:
     """A record with means and products about ``origin``, whose averages can be taken."""
-    if spread is None:
-        return values
-    deviations = [mean - x for mean, x in zip(values, origin, strict=False)]
-    products = zip(values[len(origin) :], spread(deviations), strict=True)
-    return deviations + [own + added for own, added in products]
+    if not spread:
+        return record
+    deviations = [mean - x for mean, x in zip(record, origin, strict=False)]
+    products = record[len(origin) :]
+    for k, pairs in enumerate(spread):
+        for i, j in pairs:
+            products[k] = dr.fma(deviations[i], deviations[j], products[k])
+    return deviations + products
 
 
-def central(origin: list, averages: list, spread: Callable | None) -> list:
+def central(origin: list, averages: list, spread: Spread) -> list:
     """The record that averages about ``origin`` stand for."""
-    if spread is None:
+    if not spread:
         return averages
-    deviations = averages[: len(origin)]
-    products = zip(averages[len(origin) :], spread(deviations), strict=True)
-    means = [x + deviation for x, deviation in zip(origin, deviations, strict=True)]
-    return means + [raw - excess for raw, excess in products]
+    deviations, products = averages[: len(origin)], averages[len(origin) :]
+    for k, pairs in enumerate(spread):
+        for i, j in pairs:
+            products[k] = dr.fma(-deviations[i], deviations[j], products[k])
+    return [x + deviation for x, deviation in zip(origin, deviations, strict=True)] + products
 
 
 # ------------------------------------------------------------------------------------------------
@@ -157,7 +163,7 @@ def smooth(
     along: int,
     target: Axis,
     variance: float,
-    spread: Callable | None,
+    spread: Spread,
 ) -> list:
     """Average samples over a Gaussian along one axis, and take new samples of the result.
 
@@ -241,14 +247,12 @@ def quad_averages(over_quad: Callable, normals, axes: tuple[Axis, Axis]):
     return over_quad(corners), quads
 
 
-def record_of(moments: Callable, spread: Callable | None, normal) -> list:
+def record_of(moments: Callable, spread: Spread, normal) -> list:
     """The record of a single normal, which deviates from nothing."""
-    means = moments(normal)
-    products = [] if spread is None else spread(means)
-    return means + [dr.zeros(mi.Float, dr.width(normal)) for _ in products]
+    return moments(normal) + [dr.zeros(mi.Float, dr.width(normal)) for _ in spread]
 
 
-def midpoint_rule(moments: Callable, spread: Callable | None, corners: list) -> list:
+def midpoint_rule(moments: Callable, spread: Spread, corners: list) -> list:
     """Averages over a quad of moments of its normals, by the midpoints of its triangles' edges.
 
     Over the two triangles of a quad the projected normal is linear. The rule integrates its
@@ -353,9 +357,8 @@ class MomentPyramid:
         moments: function of projected normals (``mi.Vector2f``) that returns a list of ``mi.Float``
             whose averages are wanted, any number of them. None for a chain without the texels
             themselves, for footprints no narrower than level 1.
-        spread: function of deviations, a list as ``moments`` returns it, that returns a list of
-            products of them. Their averages over the footprint, central second moments, follow the
-            averages of ``moments`` in everything that is stored and returned.
+        spread (Spread): products of deviations from the averages of ``moments``. Their own
+            averages, central second moments, follow in everything that is stored and returned.
         between (bool): whether what means differ by between samples of the chain, and between
             lookups, adds to those products.
         finish: function from the averages of a sample of the chain to what is stored there and
@@ -380,10 +383,10 @@ class MomentPyramid:
         max_anisotropy: float = 16.0,
         over_quad: Callable | None = None,
         reach: Reach | None = None,
-        spread: Callable | None = None,
+        spread: Spread = (),
         between: bool = True,
     ) -> None:
-        self.spread = spread if between else None
+        self.spread = spread if between else ()
         self.height, self.width, _ = data.shape
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
         self.periodic = wrap_mode != "clamp"
@@ -578,7 +581,7 @@ class MomentPyramid:
 
     def nearest_means(self, position, grid: Grid) -> list:
         """The means of a level's sample that is nearest to a position, for an origin."""
-        if self.spread is None:
+        if not self.spread:
             return []
         first, second, f = self.corners(position, grid)
         x, y = dr.select(f < 0.5, first, second)
@@ -592,9 +595,8 @@ class MomentPyramid:
         records = [
             about(origin, self.record(row + x), self.spread) for row in rows for x in (x0, x1)
         ]
-        averages = [
-            sum(value * w for value, w in zip(values, weight, strict=True))
-            for values in zip(*records, strict=True)
-        ]
+        averages = [value * weight[0] for value in records[0]]
+        for record, w in zip(records[1:], weight[1:], strict=True):
+            averages = [dr.fma(x, w, total) for x, total in zip(record, averages, strict=True)]
         # Between two samples, weighed 1 − f and f, interpolation adds the variance f (1 − f) h².
         return averages, grid.variance + dr.dot(f * (1 - f), grid.half_square)

@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import check, check_choice
 from ..footprint import Footprint
 from ..microfacet import SmithMasking
-from ..moments import MomentPyramid
+from ..moments import MomentPyramid, Spread
 from ..normalmap import MAX_SLOPE, NormalMap, check_texels
 from ..reach import Reach
 from ..slope_lobe import DISTRIBUTIONS, SlopeLobe
@@ -40,25 +40,18 @@ def unit_normal(s) -> list:
     return [s.x, s.y, squared / (1 + dr.sqrt(1 - squared))]
 
 
-def covariance(d: list) -> list:
-    """LEAN (Olano and Baker 2010): the variances along u and v, and the covariance."""
-    return [d[0] * d[0], d[1] * d[1], d[0] * d[1]]
+#: The variances along the first and the second axis.
+VARIANCES: Spread = (((0, 0),), ((1, 1),))
 
+#: LEAN (Olano and Baker 2010): these, and the covariance.
+COVARIANCE: Spread = (*VARIANCES, ((0, 1),))
 
-def variances(d: list) -> list:
-    """The variances along u and v."""
-    return covariance(d)[:2]
+#: The sum of the variances of slopes; half of it is what CLEAN keeps (Baker, "Spectacular Specular:
+#: LEAN and CLEAN Specular Highlights", GDC 2011).
+TOTAL: Spread = (((0, 0), (1, 1)),)
 
-
-def mean_variance(d: list) -> list:
-    """CLEAN (Baker, "Spectacular Specular: LEAN and CLEAN Specular Highlights", GDC 2011): the mean
-    of the variances along u and v."""
-    return [0.5 * sum(variances(d))]
-
-
-def total_variance(d: list) -> list:
-    """Of unit normals ``1 − l²``, if their mean has the length l."""
-    return [sum(x * x for x in d)]
+#: The same of unit normals: ``1 − l²``, if their mean has the length l.
+TOTAL_3D: Spread = (((0, 0), (1, 1), (2, 2)),)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -84,8 +77,8 @@ def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> Slo
 
 def clean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
     """CLEAN (Baker 2011): as LEAN, with the mean of both variances along every direction."""
-    x, y, variance = averages
-    return round_lobe(mi.Vector2f(x, y), alpha_squared + 2 * positive(variance), distribution)
+    x, y, total = averages
+    return round_lobe(mi.Vector2f(x, y), alpha_squared + positive(total), distribution)
 
 
 def variance_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
@@ -151,7 +144,7 @@ class Method:
     the averages; see :class:`~glintbsdf.moments.MomentPyramid`."""
 
     moments: Callable
-    spread: Callable
+    spread: Spread
     lobe: Callable
     distributions: tuple[str, ...] = ("beckmann",)
     between: bool = True
@@ -159,11 +152,11 @@ class Method:
 
 #: Distributions are those that a method's authors, or RTR, define it for.
 METHODS = {
-    "toksvig": Method(unit_normal, total_variance, toksvig_lobe, DISTRIBUTIONS),
-    "lean": Method(slope, covariance, lean_lobe),
-    "clean": Method(slope, mean_variance, clean_lobe),
-    "leadr": Method(slope, covariance, lean_lobe),  # LEAN with masking and projection
-    "variance": Method(slope, variances, variance_lobe, DISTRIBUTIONS, between=False),
+    "toksvig": Method(unit_normal, TOTAL_3D, toksvig_lobe, DISTRIBUTIONS),
+    "lean": Method(slope, COVARIANCE, lean_lobe),
+    "clean": Method(slope, TOTAL, clean_lobe),
+    "leadr": Method(slope, COVARIANCE, lean_lobe),  # LEAN with masking and projection
+    "variance": Method(slope, VARIANCES, variance_lobe, DISTRIBUTIONS, between=False),
 }
 
 
