@@ -50,7 +50,7 @@ MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
 MAX_SEEDS = 4
 
 #: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
-#: takes half of its 1120 MB then at a step of half a texel, and a quarter of that at one texel.
+#: takes 430 of its 1120 MB then at a step of half a texel, and 170 at one texel.
 BYTES_PER_CELL = 42, 96
 
 #: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
