@@ -22,7 +22,8 @@ number. With its own residuals and τ = 0.004, the authors' code errs by 0.26 to
 ``renders`` (Fig. 15, Table 3): the curved patch with scratches, 64² texels a footprint: root mean
 square error against the exact render of another seed, both clipped to [0, 1], relative to the mean,
 and the time over the exact one's; the row "exact" is the noise. Expected: errors grow with τ, as in
-the paper; those of tables stay within the noise.
+the paper; those of tables stay within the noise. Measured with ``--quick``: all are within the
+noise of its 16 samples; τ = 1 takes 0.54 of the time, tables with ``max_error`` 0.05 take 0.25.
 
 ``kernels`` (Fig. 16): the isotropic map with the Gaussian at 128² texels and with the disk and the
 box, which reach half as far at the same σ: 64². Expected: half the time; the same look.
