@@ -7,7 +7,7 @@ angle. Both materials render in turn in every repetition, after a first frame th
 figures are the median time and the median of the ratio within the same repetition. First frames
 start without Dr.Jit's kernel cache on disk; building and loading are timed apart. Expected before
 measuring: 1.5 × at 1/16 pixel, 4 × at 1 pixel, 15 × at 4 pixels. Measured, on a machine with other
-work: 1.2 ×, 2.5 × (2.8 × with ``-D masking=ggx_fit``) and 8.6 ×.
+work: 1.1 to 1.2 ×, 2.5 to 2.6 × (2.8 to 2.9 × with ``-D masking=ggx_fit``) and 8.6 ×.
 """
 
 from __future__ import annotations
