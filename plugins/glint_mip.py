@@ -48,8 +48,8 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
  * - overlap
    - |int|
    - Texels by which patches reach into each other, at least 1 and fewer than half a patch's. More
-     of them make seams smoother; fewer leave more lobes to what is clustered at them. (Default: an
-     eighth of :monosp:`patch_size`)
+     of them make seams smoother; fewer leave more lobes to what is clustered at them. (Default: a
+     tenth of :monosp:`patch_size`)
 
  * - balance
    - |float|
@@ -107,12 +107,12 @@ with :math:`t` the weights of linear interpolation between two levels, :math:`w_
 lobe under the footprint, and :math:`R_i` what its normals vary in one place. Sampling draws from
 exactly this density, and it integrates to one.
 
-Of a sample of 256×256 texels made 4096×4096, everything together takes 24 MB. Building it takes
-some 15 seconds of processor time, once: the cache on disk keeps it. The map can be written out with
+Of a sample of 256×256 texels made 4096×4096, everything together takes 22 MB. Building it takes
+some 14 seconds of processor time, once: the cache on disk keeps it. The map can be written out with
 :monosp:`glintbsdf synthesise`, for other plugins or to look at. In smooth maps seams remain, since
 two patches agree along their edges by chance only: in the overlaps, neighbouring texels of a map of
-Gaussian bumps differ by 1.5 times as much (squared) as elsewhere, those of leather, flakes and
-brushed metal by as much. What is longer than a patch, such as a scratch, is seen to be cut.
+Gaussian bumps differ by 1.6 times as much (squared) as elsewhere, those of leather, flakes and
+brushed metal by 1.1 to 1.3. What is longer than a patch, such as a scratch, is seen to be cut.
 
 Where lobes are clustered, their details are lost: for footprints 16, 32, 64 and 128 texels wide the
 P-NDF differs from that of :ref:`glint_elements <bsdf-glint_elements>` on the same map by 25, 17, 12

@@ -189,8 +189,8 @@ def test_cells_nearby_show_different_parts_of_the_sample():
         assert distance == 0 or offset.min() >= side / 2**distance
 
 
-def test_the_default_overlap_is_an_eighth_of_a_patch():
-    sizes = {"output_size": 100, "patch_size": 24}
+def test_the_default_overlap_is_a_tenth_of_a_patch():
+    sizes = {"output_size": 100, "patch_size": 30}
     default, given = synthesise(SMOOTH, **sizes), synthesise(SMOOTH, **sizes, overlap=3)
     assert np.array_equal(default.explicit(), given.explicit())
     assert synthesise(SMOOTH, output_size=20, patch_size=3).overlap == 1

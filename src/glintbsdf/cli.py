@@ -324,7 +324,7 @@ def pndf(
 )
 @click.option("--output-size", type=int, default=4096, show_default=True, help="Its texels.")
 @click.option("--patch-size", type=int, default=64, show_default=True, help="Texels of a patch.")
-@click.option("--overlap", type=int, help="Texels patches share; an eighth of a patch's.")
+@click.option("--overlap", type=int, help="Texels patches share; a tenth of a patch's.")
 @click.option(
     "--balance",
     type=float,

@@ -215,7 +215,7 @@ def check_sizes(
 ) -> int:
     """Raise :class:`~glintbsdf.errors.ParameterError` unless patches of that size fit.
 
-    Returns the overlap: that given, or an eighth of a patch.
+    Returns the overlap: that given, or a tenth of a patch.
     """
     check_whole(
         patch_size,
@@ -225,7 +225,7 @@ def check_sizes(
         f"≥ 3 and smaller than the sample of {sample[1]} x {sample[0]} texels",
     )
     if overlap is None:
-        overlap = max(1, patch_size // 8)
+        overlap = max(1, patch_size // 10)
     check_whole(
         overlap,
         lambda size: 1 <= size < patch_size / 2,
@@ -279,7 +279,7 @@ def synthesise(
         output_size: texels of the large map along each axis, larger than a patch.
         patch_size: texels of a patch along each axis, fewer than the sample's.
         overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2. Default: an
-            eighth of a patch. (The paper has 2 texels of 64; seams of smooth maps show then.)
+            tenth of a patch. (The paper has 2 texels of 64; seams of smooth maps show then.)
         balance: α of Eq. 7, in [0, 1]: 1 compares normals alone, 0 their Jacobians.
         tolerance: patches are chosen at random among those whose mean error over the overlap is at
             most this multiple of the mean error between neighbouring texels of the sample; where
