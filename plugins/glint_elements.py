@@ -11,7 +11,8 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
  * - sigma_r
    - |float|
    - Intrinsic roughness: the standard deviation of a projected normal, in [1e-8, 1]. Glints of
-     flat places of the map are this wide. (Default: 0.005)
+     flat places of the map are this wide; half vectors in single precision resolve them down to
+     1e-7. (Default: 0.005)
    - |exposed|, |differentiable|
 
  * - step
@@ -59,11 +60,11 @@ where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\
 :ref:`glint_manifold <bsdf-glint_manifold>`, it is smooth: roughness :math:`\sigma_r` is part of it.
 
 Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,
-and the lists of elements by normal, from which large footprints are evaluated, up to 90, or 42 with
+and the lists of elements by normal, from which large footprints are evaluated, up to 96, or 42 with
 a :monosp:`step` of 1. The cost grows with the area of the footprint.
 
 The sum is cut where elements weigh little: 3 standard deviations from the footprint's centre, where
-they fade, and 3.7 from the mean of an element's normals. The integral of :math:`D` is one within
+they fade, and 3.94 from the mean of an element's normals. The integral of :math:`D` is one within
 1e-3 for every footprint.
 
 Flakes share the whole surface among them: seen from afar they cover it evenly, and a point shows

@@ -47,9 +47,10 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
    - |float|
    - Size of the footprint (geometric mean of its standard deviations), in texels, from which the
      P-NDF gives way to LEAN's smooth lobe, which is all that is left at twice the size; 0 for
-     never. Under the sun, a map of
-     Gaussian bumps 6 texels wide differs from the lobe by 8 % at 64 texels and 4 % at 128; maps of
-     scratches or flakes differ from a smooth lobe at any size. (Default: 0)
+     never. Under the sun, a map of Gaussian bumps 6 texels wide differs from the lobe by 8 % at 64
+     texels and 4 % at 128; maps of scratches or flakes differ from a smooth lobe still at 256. The
+     lobe of a map as steep as slopes of 200 reflects more light than arrives at grazing angles.
+     (Default: 0)
 
  * - masking
    - |string|
