@@ -28,8 +28,10 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
  * - max_error
    - |float|
-   - Relative L1 error of the P-NDF allowed, over bins of 1/128 of the range of the map's normals;
-     0.05, say. Footprints large enough for it are evaluated from tables of the normals around the
+   - Relative L1 error of the P-NDF allowed, over the bins of the tables, 1/128 of the range of the
+     map's normals, at least 1e-4; 0.05, say. Within a bin normals are spread evenly: finer bins, or
+     bins that lie otherwise, differ by more where many facets have nearly the same normal, as
+     flakes have. Footprints large enough for it are evaluated from tables of the normals around the
      nodes of a lattice, whose distance grows with the footprint, at a cost that does not; small
      ones exactly. The error is predicted from the footprint and from errors measured on the map,
      for the kernel in use, when the tables are built. Over six kinds of maps and footprints from 11

@@ -41,7 +41,8 @@ class TabulatedManifold(Manifold):
 
     Args:
         max_error (float): relative L1 error of the P-NDF allowed, > 0, on the bins of the tables:
-            1/128 of the range of the map's normals. The error predicted stays below; the one
+            1/128 of the range of the map's normals, at least 1e-4. Within a bin normals are spread
+            evenly: bins that lie otherwise differ by more. The error predicted stays below; the one
             measured, averaged over three places, is 0.63 to 0.96 of it on six kinds of maps, 0.45
             to 0.95 for kernels with an edge, up to 1.2 at a single place (``benchmarks/tables.py
             --errors``). Footprints so small that it would be larger are evaluated exactly.
