@@ -39,7 +39,7 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
      of it (:monosp:`disk`: 0.56 to 0.95, :monosp:`box`: 0.45 to 0.91), and up to 1.2 at a single
      place. On a map of 1024², with 0.05, tables serve Gaussian footprints from 7 to 16 texels on,
      those of kernels with an edge later. Each level of the tables takes up to 62 MiB, all with the
-     lists for small footprints up to 181 MiB. From exact to tabulated there is no transition but a
+     lists for small footprints up to 190 MiB. From exact to tabulated there is no transition but a
      change by less than this error. Sampling stays exact. The tables have no derivatives with
      respect to :monosp:`data`: as long as derivatives are asked for there, evaluation is exact at
      all sizes, as it always is with the :monosp:`wrap_mode` :monosp:`clamp`. With 0, evaluation is
