@@ -115,11 +115,10 @@ Gaussian bumps differ by 1.6 times as much (squared) as elsewhere, those of leat
 brushed metal by 1.1 to 1.3. What is longer than a patch, such as a scratch, is seen to be cut.
 
 Where lobes are clustered, their details are lost: for footprints 16, 32, 64 and 128 texels wide the
-P-NDF differs from that of :ref:`glint_elements <bsdf-glint_elements>` on the same map by 25, 17, 12
-and 9 % (relative L1) on a map of Gaussian bumps, and by 7 to 10 % on one of scratches. Narrower
-footprints see the lobes of texels, which differ by 7 to 12 %. At 64 texels a query takes a ninth of
-the time that the elements take, on scratches a twentieth, at 16 about as long, and below two to
-four times as long; where most of the surface reflects nothing, the elements are faster still.
+P-NDF differs from that of :ref:`glint_elements <bsdf-glint_elements>` on the same map by 24, 16, 12
+and 9 % (relative L1) on a map of Gaussian bumps, and by 7 to 10 % on one of scratches. At 64 texels
+a query takes a seventh of the time that the elements take, at 16 and below two to four times as
+long; where most of the surface reflects nothing, the elements are faster still.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
