@@ -1,7 +1,7 @@
 """What ``stability.py`` measures of a BSDF: plain functions that return numbers, and do not judge.
 
 The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as for the checks of
-``tests/bsdf_suite.py``, whose views, densities and χ² test are used here.
+``src/glintbsdf/check/suite.py``, whose views, densities and χ² test are used here.
 """
 
 from __future__ import annotations
@@ -12,18 +12,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import radians
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.footprint import Footprint
+from glintbsdf.check import suite  # noqa: E402
+from glintbsdf.check.suite import View  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.pndf import Grid
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
-import bsdf_suite as suite  # noqa: E402
-from bsdf_suite import View  # noqa: E402
 
 Array = np.ndarray
 

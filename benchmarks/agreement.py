@@ -27,9 +27,9 @@ import glintbsdf
 mi.set_variant("llvm_ad_rgb")
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
+from glintbsdf.check.reference import binned_pndf  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.pndf import Manifold  # noqa: E402
-from glintbsdf.reference import binned_pndf  # noqa: E402
 
 EPSILON = 1e-3
 

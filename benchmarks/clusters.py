@@ -62,10 +62,10 @@ from _common import (  # noqa: E402
 from curved_patch import UV_SCALE, curved_patch  # noqa: E402
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
-from glintbsdf.kernels import KERNELS  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
+from glintbsdf.footprint.kernels import KERNELS  # noqa: E402
 from glintbsdf.pndf import ClusteredManifold, Manifold, TabulatedManifold  # noqa: E402
-from glintbsdf.rendering import pixel_angle  # noqa: E402
+from glintbsdf.scene.rendering import pixel_angle  # noqa: E402
 
 RADII = (32, 64, 128)
 THRESHOLDS = (1e-2, 1e-1, 1.0, 10.0)

@@ -41,9 +41,9 @@ from _common import (  # noqa: E402
 )
 
 from glintbsdf import Footprint, NormalMap, maps  # noqa: E402
+from glintbsdf.check.plot import colour_map  # noqa: E402
+from glintbsdf.check.reference import _normals_at, binned_pndf, texel_covariance  # noqa: E402
 from glintbsdf.pndf import Elements, Manifold  # noqa: E402
-from glintbsdf.pndf_plot import colour_map  # noqa: E402
-from glintbsdf.reference import _normals_at, binned_pndf, texel_covariance  # noqa: E402
 
 SIZE, RES, POINTS = 256, 96, 5
 SIGMA_R = 0.005

@@ -33,7 +33,7 @@ from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # n
 from curved_patch import MAP, UV_SCALE, curved_patch  # noqa: E402
 
 from glintbsdf.pndf import Elements  # noqa: E402
-from glintbsdf.rendering import pixel_angle  # noqa: E402
+from glintbsdf.scene.rendering import pixel_angle  # noqa: E402
 
 #: Megabytes that the paper's elements and hierarchy take for 2048², by step.
 PAPER = {0.5: 1120, 1.0: 280}

@@ -24,7 +24,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from _common import save_results  # noqa: E402
 
-from glintbsdf.gaussian_lobes import SIGMA_H, Gaussian, Overlap  # noqa: E402
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap  # noqa: E402
 
 Array = np.ndarray
 
@@ -73,7 +73,7 @@ def appendix(d: Array, s: Array, jacobian: Array, sigma_p: Array, sigma_r: float
 
 
 def ours(d: Array, s: Array, jacobian: Array, axes: Array, sigma_r: float) -> Array:
-    """The same by :mod:`glintbsdf.gaussian_lobes`; ``axes`` (N, 2, 2): those of the footprint."""
+    """The same by ``gaussian_elements.py``; ``axes`` (N, 2, 2): those of the footprint."""
     footprint = Gaussian(tuple(mi.Vector2f(axes[:, k].T) for k in range(2)))
     overlap = Overlap(footprint, Gaussian(variance=SIGMA_H**2))
     j = mi.Matrix2f(np.ascontiguousarray(jacobian.transpose(1, 2, 0)))

@@ -46,6 +46,7 @@ import mitsuba as mi  # isort: skip # noqa: E402
 
 mi.set_variant("llvm_ad_rgb")
 
+from glintbsdf.cli.main import interruptible  # noqa: E402
 from report import grid, images, output, pndf  # noqa: E402
 from report.methods import BASELINES, CASES, METHODS, Case, Method, given  # noqa: E402
 from report.store import Store, machine  # noqa: E402
@@ -58,8 +59,7 @@ from rich.progress import (  # noqa: E402
     TimeElapsedColumn,
 )
 
-from glintbsdf.cli import interruptible  # noqa: E402
-from glintbsdf.truth import Truth  # noqa: E402
+from glintbsdf.check.truth import Truth  # noqa: E402
 
 
 @dataclass(frozen=True)

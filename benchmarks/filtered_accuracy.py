@@ -29,10 +29,10 @@ import glintbsdf
 mi.set_variant("llvm_ad_rgb")
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
+from glintbsdf.check.reference import binned_pndf, texel_covariance  # noqa: E402
+from glintbsdf.check.truth import refined, wrapped  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.pndf import Filtered  # noqa: E402
-from glintbsdf.reference import binned_pndf, texel_covariance  # noqa: E402
-from glintbsdf.truth import refined, wrapped  # noqa: E402
 
 #: Standard deviations of footprints, texels: levels of the chain, between levels, stretched.
 FOOTPRINTS = [

@@ -26,8 +26,8 @@ mi.set_variant("llvm_ad_rgb")
 from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # noqa: E402
 from curved_patch import MAP, UV_SCALE, curved_patch  # noqa: E402
 
-from glintbsdf.pndf.filtered import METHODS  # noqa: E402
-from glintbsdf.rendering import pixel_angle  # noqa: E402
+from glintbsdf.pndf.filters.filters import METHODS  # noqa: E402
+from glintbsdf.scene.rendering import pixel_angle  # noqa: E402
 
 
 def frame(scene: mi.Scene, spp: int, seed: int) -> mi.TensorXf:

@@ -29,11 +29,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 from curved_patch import MAP, UV_SCALE, curved_patch  # noqa: E402
 
-from glintbsdf.footprint import Footprint  # noqa: E402
-from glintbsdf.pndf.filtered import METHODS  # noqa: E402
-from glintbsdf.reference import binned_pndf, texel_covariance  # noqa: E402
-from glintbsdf.rendering import pixel_angle  # noqa: E402
-from glintbsdf.truth import mirrors, reference_render  # noqa: E402
+from glintbsdf.check.reference import binned_pndf, texel_covariance  # noqa: E402
+from glintbsdf.check.truth import mirrors, reference_render  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
+from glintbsdf.pndf.filters.filters import METHODS  # noqa: E402
+from glintbsdf.scene.rendering import pixel_angle  # noqa: E402
 
 #: Radius of the lights of the images: brute force finds the scene's own too seldom.
 LIGHT_RADIUS = 0.07

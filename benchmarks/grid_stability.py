@@ -32,9 +32,9 @@ import glintbsdf
 
 mi.set_variant("llvm_ad_rgb")
 
-from glintbsdf.footprint import Footprint  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.pndf import Grid  # noqa: E402
-from glintbsdf.pndf.grid import CoveredCells  # noqa: E402
+from glintbsdf.pndf.grid.microdetails import CoveredCells  # noqa: E402
 
 FRAMES, SIZE = 32, 256
 ANGLE = math.radians(20)  # of the long axis of a pixel

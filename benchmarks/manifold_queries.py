@@ -30,7 +30,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from first_versions import FirstLists, PlainLoop  # noqa: E402
 
-from glintbsdf.footprint import Footprint  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.pndf import Manifold  # noqa: E402
 
 #: Radius in texels, and number of queries: about a second each for the slowest version.

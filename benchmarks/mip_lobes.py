@@ -39,10 +39,10 @@ import glintbsdf
 mi.set_variant("llvm_ad_rgb")
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
+from glintbsdf.check.plot import colour_map  # noqa: E402
+from glintbsdf.check.reference import binned_pndf  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.pndf import Elements, Mip  # noqa: E402
-from glintbsdf.pndf_plot import colour_map  # noqa: E402
-from glintbsdf.reference import binned_pndf  # noqa: E402
 
 WIDTHS = (8, 16, 32, 64, 128, 256, 512)
 #: Wider footprints would keep the reference busy for minutes.

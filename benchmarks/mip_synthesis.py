@@ -38,8 +38,8 @@ import glintbsdf
 mi.set_variant("llvm_ad_rgb")
 
 from glintbsdf import NormalMap, maps  # noqa: E402
+from glintbsdf.maps.quilting import lobe_features, synthesise  # noqa: E402
 from glintbsdf.pndf import Mip  # noqa: E402
-from glintbsdf.synthesis import lobe_features, synthesise  # noqa: E402
 
 
 def white_noise(size: int) -> NormalMap:

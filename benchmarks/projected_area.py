@@ -63,10 +63,10 @@ from _common import (  # noqa: E402
 )
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
-from glintbsdf.microfacet import normal_from_projection  # noqa: E402
-from glintbsdf.pndf.manifold import TexelMesh  # noqa: E402
-from glintbsdf.projected_area import (  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
+from glintbsdf.microfacet.frame import normal_from_projection  # noqa: E402
+from glintbsdf.pndf.manifold.exact import TexelMesh  # noqa: E402
+from glintbsdf.pndf.manifold.projected_area import (  # noqa: E402
     ORDERS,
     Corners,
     GgxFit,
@@ -74,7 +74,7 @@ from glintbsdf.projected_area import (  # noqa: E402
     ProjectedAreaMasking,
     clipped_mean,
 )
-from glintbsdf.rendering import load_scene, pixel_angle  # noqa: E402
+from glintbsdf.scene.rendering import load_scene, pixel_angle  # noqa: E402
 
 SCENES = Path(__file__).parent.parent / "scenes"
 

@@ -36,8 +36,8 @@ import glintbsdf  # noqa: F401  (registers the plugins)
 
 mi.set_variant("llvm_ad_rgb")
 
-from glintbsdf import denoising  # noqa: E402
-from glintbsdf.rendering import load_scene  # noqa: E402
+from glintbsdf.scene import denoising  # noqa: E402
+from glintbsdf.scene.rendering import load_scene  # noqa: E402
 
 SCENE = Path(__file__).parent.parent / "scenes" / "interreflection.xml"
 SCENES = {

@@ -59,15 +59,15 @@ os.environ["GLINTBSDF_CACHE"] = "off"  # what is measured is built by this code
 import mitsuba as mi  # noqa: E402  (the environment comes first)
 import numpy as np  # noqa: E402
 import scipy.stats  # noqa: E402
+from glintbsdf.cli.main import interruptible  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 import glintbsdf  # noqa: E402, F401  (registers the plugins)
 from glintbsdf import NormalMap, maps  # noqa: E402
-from glintbsdf.cli import interruptible  # noqa: E402
-from glintbsdf.pndf.manifold import equilateral  # noqa: E402
-from glintbsdf.progress import progress  # noqa: E402
-from glintbsdf.rendering import replacing  # noqa: E402
+from glintbsdf.core.progress import progress  # noqa: E402
+from glintbsdf.pndf.manifold.exact import equilateral  # noqa: E402
+from glintbsdf.scene.rendering import replacing  # noqa: E402
 
 if mi.variant() is None:
     mi.set_variant("llvm_ad_rgb")
@@ -585,7 +585,7 @@ def html(judged: list, judge: Judge, header: dict) -> str:
 def fingerprint() -> str:
     """A hash of all sources that a figure may depend on."""
     root, digest = Path(__file__).parents[1], hashlib.blake2b(digest_size=12)
-    files = [*root.glob("src/**/*.py"), *root.glob("plugins/*.py"), root / "tests/bsdf_suite.py"]
+    files = [*root.glob("src/**/*.py"), *root.glob("plugins/*.py")]
     for path in sorted({*files, Path(__file__), Path(measures.__file__)}):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -38,8 +38,8 @@ import glintbsdf
 mi.set_variant("llvm_ad_rgb")
 
 from glintbsdf import maps  # noqa: E402
-from glintbsdf.footprint import Footprint  # noqa: E402
-from glintbsdf.kernels import KERNELS  # noqa: E402
+from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
+from glintbsdf.footprint.kernels import KERNELS  # noqa: E402
 from glintbsdf.pndf import Manifold, TabulatedManifold  # noqa: E402
 
 SIZE = 1024

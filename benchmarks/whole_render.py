@@ -32,7 +32,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from _common import ratios_to_first, save_results, seconds, seconds_in_turn  # noqa: E402
 
-from glintbsdf.rendering import load_scene, pixel_angle  # noqa: E402
+from glintbsdf.scene.rendering import load_scene, pixel_angle  # noqa: E402
 
 SCENE = Path(__file__).parent.parent / "scenes" / "curved_patch.xml"
 

@@ -74,5 +74,5 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
    - Factor on the reflection, in [0, 1]. (Default: 1)
    - |exposed|, |differentiable|
 
-:mod:`glintbsdf.registration` imports these modules anew in each JIT variant.
+:mod:`glintbsdf.bridge.registration` imports these modules anew in each JIT variant.
 """

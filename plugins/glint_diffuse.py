@@ -70,12 +70,12 @@ from math import pi
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.bsdf import FootprintBSDF
-from glintbsdf.diffuse import FacetDiffuse, OrenNayarDiffuse
-from glintbsdf.microfacet import above_horizon
-from glintbsdf.parameters import Parameters
-from glintbsdf.pndf.manifold import TexelMesh
-from glintbsdf.reach import Reach
+from glintbsdf.bridge.bsdf import FootprintBSDF
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.microfacet.frame import above_horizon
+from glintbsdf.pndf.manifold.diffuse import FacetDiffuse, OrenNayarDiffuse
+from glintbsdf.pndf.manifold.exact import TexelMesh
 
 METHODS = ("manifold", "oren_nayar")
 

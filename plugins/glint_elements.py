@@ -112,16 +112,16 @@ from functools import partial
 
 import mitsuba as mi
 
-from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.microfacet import (
+from glintbsdf.bridge.bsdf import GlintBSDF
+from glintbsdf.bridge.parameters import MAP_SOURCES, Parameters
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.microfacet.frame import (
     BeckmannMasking,
     FlakesBeckmannLobe,
     MapBeckmannLobe,
     MapBeckmannMasking,
 )
-from glintbsdf.parameters import MAP_SOURCES, Parameters
 from glintbsdf.pndf import Elements, Flakes
-from glintbsdf.reach import Reach
 
 
 class GlintElements(GlintBSDF):

@@ -101,13 +101,13 @@ from functools import partial
 
 import mitsuba as mi
 
-from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.errors import check
-from glintbsdf.footprint import Footprint
-from glintbsdf.parameters import Parameters
-from glintbsdf.pndf.filtered import METHODS, Filtered, LobeMasking, VisibleNormals
-from glintbsdf.reach import Reach
-from glintbsdf.slope_lobe import DISTRIBUTIONS
+from glintbsdf.bridge.bsdf import GlintBSDF
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.core.errors import check
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS
+from glintbsdf.pndf.filters.filters import METHODS, Filtered, LobeMasking, VisibleNormals
 
 
 class GlintFiltered(GlintBSDF):

@@ -133,13 +133,13 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.footprint import Footprint
-from glintbsdf.microfacet import BeckmannLobe, VisibleBeckmannNormals
-from glintbsdf.parameters import Parameters
+from glintbsdf.bridge.bsdf import GlintBSDF
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.spectra import ColorConversion
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.microfacet.frame import BeckmannLobe, VisibleBeckmannNormals
 from glintbsdf.pndf import Grid
-from glintbsdf.pndf.grid import Palette, Wheel
-from glintbsdf.spectra import ColorConversion
+from glintbsdf.pndf.grid.microdetails import Palette, Wheel
 
 
 class GlintGrid(GlintBSDF):

@@ -115,14 +115,14 @@ from functools import partial
 
 import mitsuba as mi
 
-from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.errors import check
-from glintbsdf.kernels import KERNELS
-from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
-from glintbsdf.parameters import Parameters
+from glintbsdf.bridge.bsdf import GlintBSDF
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.core.errors import check
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.kernels import KERNELS
+from glintbsdf.microfacet.frame import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.pndf import ClusteredManifold, HandOver, Manifold, TabulatedManifold
-from glintbsdf.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
-from glintbsdf.reach import Reach
+from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
 
 MASKINGS = ("ggx_fit", "analytic", "beckmann", "none")
 

@@ -149,9 +149,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from glintbsdf.bsdf import GlintBSDF
-from glintbsdf.microfacet import MapBeckmannLobe, MapBeckmannMasking
-from glintbsdf.parameters import Parameters
+from glintbsdf.bridge.bsdf import GlintBSDF
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.microfacet.frame import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.pndf import Mip
 
 

@@ -64,7 +64,7 @@ channels, :monosp:`direct.R`, :monosp:`.G`, :monosp:`.B` and :monosp:`indirect.R
 :monosp:`.B`, which add up to the whole. Two directions are followed where a path first meets a
 rough surface, one by the glints, for emitters only, and one by the smooth lobe. The indirect image
 differs in expectation from that of :monosp:`separate` off as far as the smooth lobe differs from
-the glints. In BSDFs of one's own: see ``glintbsdf.separation``.
+the glints. In BSDFs of one's own: see ``glintbsdf.bridge.separation``.
 
 .. tabs::
     .. code-tab:: xml
@@ -87,9 +87,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.errors import check
-from glintbsdf.raycone import RayCone, curved_interaction, lobe_width
-from glintbsdf.separation import smooth_context
+from glintbsdf.bridge.separation import smooth_context
+from glintbsdf.core.errors import check
+from glintbsdf.footprint.raycone import RayCone, curved_interaction, lobe_width
 
 
 class GlintPathIntegrator(mi.SamplingIntegrator):

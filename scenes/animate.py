@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 import glintbsdf  # noqa: F401  (makes the plugins known)
-from glintbsdf import rendering
-from glintbsdf.progress import progress
+from glintbsdf.core.progress import progress
+from glintbsdf.scene import rendering
 
 COLUMNS = 5
 

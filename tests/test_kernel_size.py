@@ -13,9 +13,9 @@ import mitsuba as mi
 import pytest
 
 from glintbsdf import Footprint, NormalMap, maps
+from glintbsdf.bridge.separation import smooth_context
+from glintbsdf.footprint.domain import Recorder
 from glintbsdf.pndf import Elements, Filtered, Manifold
-from glintbsdf.reach import Recorder
-from glintbsdf.separation import smooth_context
 
 LANES = 16
 MAP = maps.isotropic(32, seed=1)

@@ -12,7 +12,7 @@ import pytest
 
 import glintbsdf
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[1]
 
 
 def python(script: str) -> str:
@@ -36,7 +36,7 @@ def test_import_is_light_and_chooses_no_variant():
     heavy = {"numpy", "scipy", "skimage", "OpenEXR", "click", "rich", "matplotlib", "platformdirs"}
     assert not heavy & set(output)
     own = {name for name in output if name.startswith("glintbsdf")}
-    assert own == {"glintbsdf", "glintbsdf.llvm", "glintbsdf.registration"}
+    assert own == {"glintbsdf", "glintbsdf.bridge.llvm", "glintbsdf.bridge.registration"}
 
 
 def test_choosing_a_variant_loads_no_image_or_plotting_library(variant):

@@ -17,8 +17,8 @@ import mitsuba as mi
 import numpy as np
 from _common import seconds_in_turn
 
-from glintbsdf.footprint import Footprint
-from glintbsdf.pndf.grid import Grid, beckmann, slope_jacobian
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.pndf.grid.microdetails import Grid, beckmann, slope_jacobian
 
 from .pndf import batch
 

@@ -12,8 +12,8 @@ import numpy as np
 import scipy.stats
 from curved_patch import curved_patch
 
-from glintbsdf.rendering import pixel_angle
-from glintbsdf.truth import Truth, reference_render
+from glintbsdf.check.truth import Truth, reference_render
+from glintbsdf.scene.rendering import pixel_angle
 
 from .methods import BASELINES, Method, Surface
 from .pndf import timed

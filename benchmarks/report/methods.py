@@ -10,8 +10,8 @@ from pathlib import Path
 import mitsuba as mi
 
 from glintbsdf import NormalMap, maps
-from glintbsdf.synthesis import synthesise
-from glintbsdf.truth import mirrors
+from glintbsdf.check.truth import mirrors
+from glintbsdf.maps.quilting import synthesise
 
 #: Roughness σ_r on the disk that elements, lobes and filters add to the map, so that they answer
 #: one question. A filter's α is √2 times that.

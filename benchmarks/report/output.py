@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from glintbsdf.rendering import replacing
+from glintbsdf.scene.rendering import replacing
 
 from . import figures, images, page, pareto
 

@@ -10,7 +10,7 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from glintbsdf.pndf_plot import colour_map
+from glintbsdf.check.plot import colour_map
 
 #: Brightness is this power of density: a few peaks would leave all else black.
 _GAMMA = 0.5

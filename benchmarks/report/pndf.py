@@ -14,9 +14,9 @@ import numpy as np
 from _common import seconds, seconds_in_turn
 
 from glintbsdf import NormalMap
-from glintbsdf.footprint import Footprint
-from glintbsdf.pndf.manifold import TexelMesh
-from glintbsdf.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
+from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.pndf.manifold.exact import TexelMesh
 
 from .methods import EXACT, SIGMA_R, Method, Surface
 

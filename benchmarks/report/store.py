@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 import glintbsdf
-from glintbsdf.rendering import replacing
+from glintbsdf.scene.rendering import replacing
 
 _ROOT = Path(__file__).parents[2]
 _TEXT = "__json__"

@@ -10,26 +10,30 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from . import llvm as _llvm
+from glintbsdf.bridge import llvm as _llvm
 
 # Dr.Jit loads LLVM when it is imported, so the choice comes before anything imports Mitsuba.
 _llvm.choose()
 
-from . import registration as _registration  # noqa: E402
+from glintbsdf.bridge import registration as _registration  # noqa: E402
 
 _registration.install()
 
 if TYPE_CHECKING:
-    from . import maps, pndf, reference
-    from .errors import ParameterError
-    from .footprint import Footprint
-    from .normalmap import NormalMap
+    from glintbsdf import maps, pndf, reference
+    from glintbsdf.core.errors import ParameterError
+    from glintbsdf.footprint.gaussian import Footprint
+    from glintbsdf.maps.normalmap import NormalMap
 
 __version__ = "0.1.0"
 
 __all__ = ["Footprint", "NormalMap", "ParameterError", "maps", "pndf", "reference"]
 
-_HOMES = {"Footprint": "footprint", "NormalMap": "normalmap", "ParameterError": "errors"}
+_HOMES = {
+    "Footprint": "footprint.gaussian",
+    "NormalMap": "maps.normalmap",
+    "ParameterError": "core.errors",
+}
 
 
 def __getattr__(name: str) -> object:

@@ -1,5 +1,5 @@
 """``python -m glintbsdf``: the command line."""
 
-from .cli import main
+from glintbsdf.cli.main import main
 
 main()

@@ -1,14 +1,14 @@
 """Estimators of the P-NDF, the distribution of normals seen through a footprint."""
 
-from .clustered import ClusteredManifold
-from .elements import Elements
-from .filtered import Filtered
-from .flakes import Flakes
-from .grid import Grid
-from .hand_over import HandOver
-from .manifold import Manifold
-from .mip import Mip
-from .tabulated import TabulatedManifold
+from glintbsdf.pndf.elements.elements import Elements
+from glintbsdf.pndf.elements.flakes import Flakes
+from glintbsdf.pndf.filters.filters import Filtered
+from glintbsdf.pndf.filters.hand_over import HandOver
+from glintbsdf.pndf.grid.microdetails import Grid
+from glintbsdf.pndf.manifold.clustered import ClusteredManifold
+from glintbsdf.pndf.manifold.exact import Manifold
+from glintbsdf.pndf.manifold.tabulated import TabulatedManifold
+from glintbsdf.pndf.mip.mip import Mip
 
 __all__ = [
     "ClusteredManifold",

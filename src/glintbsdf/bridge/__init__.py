@@ -1,0 +1,1 @@
+"""The Mitsuba side: base classes, parameters, registration in every variant, LLVM."""

@@ -1,0 +1,1 @@
+"""Independent checks: references, truth, plots, the suite that every BSDF passes."""

@@ -1,0 +1,400 @@
+"""What every glint BSDF must pass, as plain functions: each takes a BSDF and raises on failure.
+
+The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as ``glint_path`` does. BSDFs under
+test are made with ``footprint_sigma`` 1, so that a :class:`View` gives standard deviations.
+
+A P-NDF is a field of spikes: on the sphere of directions no histogram would resolve it. Densities
+are therefore compared on the disk of projected normals, where ``pdf(wo) 4 |wo·m| / cosθ_m`` is the
+density D, and bins can be as small as the map's normals ask.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import scipy.stats
+
+from glintbsdf import NormalMap
+from glintbsdf.check.reference import binned_pndf
+
+Pair = tuple[float, float]
+Bounds = tuple[Pair, Pair]
+
+# Significance of one run of all the chi-square tests of a module (Šidák-corrected by test_count).
+SIGNIFICANCE = 0.01
+
+
+@dataclass(frozen=True)
+class View:
+    """A direction of view and a footprint: its mean and its axes (standard deviations), in UV."""
+
+    uv: Pair = (0.37, 0.61)
+    du: Pair = (0.0, 0.0)
+    dv: Pair = (0.0, 0.0)
+    wi: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def interaction(self, count: int = 1) -> mi.SurfaceInteraction3f:
+        """``count`` equal surface interactions on the plane z = 0."""
+        si = dr.zeros(mi.SurfaceInteraction3f, count)
+        si.uv, si.duv_dx, si.duv_dy = self.uv, self.du, self.dv
+        si.wi = dr.normalize(mi.Vector3f(self.wi))
+        si.t, si.n = 1, mi.Normal3f(0, 0, 1)
+        si.sh_frame = mi.Frame3f(mi.Vector3f(si.n))
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        if mi.is_spectral:
+            si.wavelengths = [440, 510, 580, 650]
+        dr.make_opaque(si)  # one compiled kernel serves all views
+        return si
+
+    def covariance(self) -> np.ndarray:
+        """The footprint's covariance, UV²."""
+        return np.outer(self.du, self.du) + np.outer(self.dv, self.dv)
+
+
+def square(
+    bsdf: dict,
+    integrator: dict | None = None,
+    from_below: bool = False,
+    lights: dict | None = None,
+    spp: int = 16,
+) -> np.ndarray:
+    """A 24 × 24 picture of a square in the plane z = 0, in one bounce under a constant sky."""
+    camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
+    if from_below:
+        camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator or {"type": "path", "max_depth": 2, "hide_emitters": True},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": camera,
+                "film": {"type": "hdrfilm", "width": 24, "height": 24},
+                "sampler": {"type": "independent", "sample_count": spp},
+            },
+            **(lights or {"sky": {"type": "constant"}}),
+            "square": {"type": "rectangle", "bsdf": bsdf},
+        }
+    )
+    image = np.array(mi.render(scene, seed=1))
+    assert np.isfinite(image).all() and (image >= 0).all()
+    return image
+
+
+# Views that break what is written carelessly, for a map of any size.
+EXTREME_VIEWS = {
+    "point": View(),
+    "tiny": View(du=(1e-7, 0), dv=(0, 1e-7)),
+    "line": View(du=(0.2, 0.1)),
+    "parallel_axes": View(du=(0.1, 0.05), dv=(0.2, 0.1)),
+    "1000:1": View(du=(0.3, 0.2), dv=(-0.0002, 0.0003)),
+    "one_map": View(du=(1, 0), dv=(0, 1)),
+    "hundred_maps": View(du=(100, 0), dv=(0, 100)),
+    "far_uv": View(uv=(1e5 + 0.25, -1e5 - 0.5), du=(0.02, 0), dv=(0, 0.02)),
+    "not_finite": View(du=(float("nan"), 0), dv=(0, float("inf"))),
+    "oblique": View(du=(0.02, 0), dv=(0, 0.02), wi=(1, 0.3, 1)),
+    "grazing": View(du=(0.02, 0), dv=(0, 0.02), wi=(1, 0, 1e-3)),
+    "almost_horizontal": View(du=(0.02, 0), dv=(0, 0.02), wi=(0, 1, 1e-7)),
+    "horizontal": View(du=(0.02, 0), dv=(0, 0.02), wi=(0, 1, 0)),
+}
+
+
+def random_numbers(count: int, dimensions: int, seed: int) -> list[mi.Float]:
+    """Uniform numbers in [0, 1), ``dimensions`` arrays of ``count``."""
+    table = np.random.default_rng(seed).random((dimensions, count), dtype=np.float32)
+    return [mi.Float(row) for row in table]
+
+
+def sample(bsdf: mi.BSDF, view: View, count: int, seed: int = 0) -> tuple:
+    """Draw ``count`` directions: ``(si, BSDFSample3f, weight)``."""
+    u = random_numbers(count, 3, seed)
+    si = view.interaction(count)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    return si, bs, weight
+
+
+def intensity(spectrum: mi.Spectrum) -> mi.UnpolarizedSpectrum:
+    """A spectrum's channels; of a Mueller matrix the first entry, which acts on intensity."""
+    return spectrum[0, 0] if mi.is_polarized else spectrum
+
+
+def density(bsdf: mi.BSDF, view: View, s: mi.Vector2f) -> mi.Float:
+    """D(s), recovered from ``bsdf.pdf``; zero where ``s`` reflects the view below the horizon."""
+    m = mi.Vector3f(s.x, s.y, dr.safe_sqrt(1 - dr.squared_norm(s)))
+    si = view.interaction(dr.width(s))
+    wo = mi.reflect(si.wi, mi.Normal3f(m))
+    return bsdf.pdf(mi.BSDFContext(), si, wo) * 4 * dr.abs(dr.dot(wo, m)) / m.z
+
+
+def mass_in_bins(
+    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 12, repetitions: int = 8
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mass of D in each of ``res``² bins over ``bounds``, and the standard error of the quadrature.
+
+    D jumps at the edges of triangles and of the kernel, so the quadrature is by jittered points
+    (``points``² strata per bin), and its error is measured from ``repetitions`` independent runs.
+    """
+    lower, upper = np.array(bounds)
+    n = res * points
+    rng = np.random.default_rng(7)
+    column, row = np.meshgrid(np.arange(n), np.arange(n))
+    runs = []
+    for _ in range(repetitions):
+        x, y = ((k + rng.random((n, n))) / n for k in (column, row))
+        s = mi.Vector2f(
+            *(np.float32(lower[i] + p.ravel() * (upper - lower)[i]) for i, p in enumerate((x, y)))
+        )
+        values = np.array(density(bsdf, view, s), np.float64)
+        runs.append(values.reshape(res, points, res, points).mean(axis=(1, 3)))
+    runs = np.array(runs) * np.prod((upper - lower) / res)
+    return runs.mean(axis=0), runs.std(axis=0, ddof=1) / np.sqrt(repetitions)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Densities
+# --------------------------------------------------------------------------------------------------
+
+
+def p_value(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray) -> float:
+    """Of Pearson's χ² test of ``counts`` in bins, out of ``total``, against the ``mass`` of each.
+
+    What the quadrature errs (``error``, a standard deviation) adds to the variance of a count. The
+    emptiest bins are taken together until they hold five expected counts.
+    """
+    order = np.argsort(mass, axis=None)
+    counts, expected = counts.ravel()[order], total * mass.ravel()[order]
+    variance = expected + (total * error.ravel()[order]) ** 2
+    pooled = np.searchsorted(np.cumsum(expected), 5) + 1
+    counts, expected, variance = (
+        np.append(x[pooled:], x[:pooled].sum()) for x in (counts, expected, variance)
+    )
+    statistic = ((counts - expected) ** 2 / variance).sum()
+    return float(scipy.stats.chi2.sf(statistic, len(counts)))
+
+
+def assert_distributed(
+    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, test_count: int
+) -> None:
+    """The test of :func:`p_value`, as one of ``test_count``.
+
+    The significance of one is :data:`SIGNIFICANCE` after Šidák's correction for them all.
+    """
+    p = p_value(counts, total, mass, error)
+    assert p > 1 - (1 - SIGNIFICANCE) ** (1 / test_count), p
+
+
+def check_chi2(
+    bsdf: mi.BSDF,
+    view: View,
+    bounds: Bounds,
+    test_count: int,
+    samples: int = 100_000,
+    res: int = 25,
+) -> None:
+    """``sample`` draws from the density that ``pdf`` states, which integrates to one.
+
+    ``bounds`` is a rectangle of the disk that holds all normals; the view must be such that nothing
+    is reflected below the horizon. A sample drawn on the very edge of a clamped triangle, which has
+    no neighbour, may be lost to float32 rounding: up to 1e-4 of them, four times what was measured.
+    """
+    si, bs, _ = sample(bsdf, view, samples)
+    m = np.array(dr.normalize(si.wi + bs.wo))[:2, np.array(bs.pdf) > 0]
+    (x_min, y_min), (x_max, y_max) = bounds
+    counts, _, _ = np.histogram2d(m[1], m[0], res, ((y_min, y_max), (x_min, x_max)))
+    lost = samples - counts.sum()
+    assert lost <= 1e-4 * samples, f"{lost} samples are invalid or outside of the bounds"
+
+    mass, error = mass_in_bins(bsdf, view, bounds, res)
+    assert_distributed(counts, samples, mass, error, test_count)
+    # 1e-4: float32 rounding, of the area of triangles above all.
+    assert abs(mass.sum() - 1) <= 4 * np.sqrt((error**2).sum()) + 1e-4, mass.sum()
+
+
+def check_against_reference(
+    bsdf: mi.BSDF,
+    normal_map: NormalMap,
+    view: View,
+    test_count: int,
+    samples: int = 200_000,
+    res: int = 25,
+    seed: int = 1,
+    **options,
+) -> None:
+    """D is the density of :func:`~glintbsdf.reference.binned_pndf` within its statistical error.
+
+    ``options`` go to the reference: kernel, epsilon, …
+    """
+    reference = binned_pndf(
+        normal_map, view.uv, view.covariance(), res=res, samples=samples, seed=seed, **options
+    )
+    counts = reference.density * reference.bin_area * samples
+    mass, error = mass_in_bins(bsdf, view, reference.bounds, res)
+    assert_distributed(counts, samples, mass, error, test_count)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Consistency
+# --------------------------------------------------------------------------------------------------
+
+
+def check_eval_pdf(bsdf: mi.BSDF, view: View, count: int = 2000) -> None:
+    """``eval_pdf`` is ``(eval, pdf)``."""
+    si, bs, _ = sample(bsdf, view, count)
+    ctx = mi.BSDFContext()
+    value, pdf = bsdf.eval_pdf(ctx, si, bs.wo)
+    assert dr.allclose(intensity(value), intensity(bsdf.eval(ctx, si, bs.wo)), rtol=1e-5)
+    assert dr.allclose(pdf, bsdf.pdf(ctx, si, bs.wo), rtol=1e-5)
+
+
+def check_weights(bsdf: mi.BSDF, view: View, count: int = 2000, strays: float = 0.01) -> None:
+    """``weight · pdf = eval`` and the sample's pdf is ``pdf(wo)``.
+
+    A half vector recomputed from ``wo`` differs from the normal drawn by float32 rounding, which
+    carries a few samples across the edge of a triangle or of the kernel, where D jumps: a share of
+    ``strays`` may differ.
+    """
+    si, bs, weight = sample(bsdf, view, count)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
+    valid = np.array(bs.pdf) > 0
+    assert valid.any()
+    for ours, theirs in ((intensity(weight) * bs.pdf, intensity(value)), (bs.pdf, pdf)):
+        ours, theirs = np.atleast_2d(np.array(ours)), np.atleast_2d(np.array(theirs))
+        ours, theirs = ours[:, valid], theirs[:, valid]
+        apart = (np.abs(ours - theirs) > 2e-3 * (np.abs(ours) + np.abs(theirs))).any(axis=0)
+        assert apart.mean() <= strays, apart.mean()
+
+
+def check_horizon(bsdf: mi.BSDF, view: View, count: int = 500) -> None:
+    """Zero value, pdf and weight wherever the view or the light is at or below the horizon."""
+    ctx, mirrored, horizontal = mi.BSDFContext(), mi.Vector3f(1, 1, -1), mi.Vector3f(1, 0, 0)
+    si, bs, _ = sample(bsdf, view, count)
+    up = mi.Vector3f(bs.wo.x, bs.wo.y, dr.abs(bs.wo.z))
+    for wi, wo in (
+        (si.wi, up * mirrored),
+        (si.wi * mirrored, up),
+        (-si.wi, -up),
+        (si.wi, -si.wi),
+        (horizontal, up),
+        (si.wi, horizontal),
+    ):
+        below = view.interaction(count)
+        below.wi = wi
+        value, pdf = bsdf.eval_pdf(ctx, below, wo)
+        assert dr.all(intensity(value) == 0, axis=None) and dr.all(pdf == 0)
+    below = sample(bsdf, replace(view, wi=(0.3, 0, -1)), count)
+    assert dr.all(below[1].pdf == 0) and dr.all(intensity(below[2]) == 0, axis=None)
+
+
+def check_finite(bsdf: mi.BSDF, view: View, count: int = 200) -> None:
+    """What is sampled and evaluated is finite and not negative."""
+    si, bs, weight = sample(bsdf, view, count)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
+    u = random_numbers(count, 2, seed=1)
+    elsewhere = bsdf.eval_pdf(
+        mi.BSDFContext(), si, mi.warp.square_to_uniform_hemisphere(mi.Point2f(u[0], u[1]))
+    )
+    albedo = bsdf.eval_diffuse_reflectance(si)
+    assert dr.all(dr.isfinite(bs.wo), axis=None)
+    for x in (
+        intensity(weight),
+        bs.pdf,
+        intensity(value),
+        pdf,
+        intensity(elsewhere[0]),
+        elsewhere[1],
+        intensity(albedo),
+    ):
+        assert dr.all(dr.isfinite(x) & (x >= 0), axis=None)
+
+
+def check_furnace(bsdf: mi.BSDF, *views: View, count: int = 20_000) -> None:
+    """Of uniform light views reflect, on average, no more than arrives, but for noise (3 sigma)."""
+    weights = [intensity(sample(bsdf, view, count)[2]) for view in views]
+    weight = np.hstack([np.atleast_2d(np.array(w)) for w in weights])
+    noise = weight.std(axis=1) / np.sqrt(weight.shape[1])
+    assert (weight.mean(axis=1) <= 1 + 3 * noise + 1e-6).all()
+
+
+def check_derivative(bsdf: mi.BSDF, view: View, key: str, count: int = 50) -> None:
+    """Forward and reverse derivatives of ``eval`` with respect to a parameter agree, and exist.
+
+    Both are taken along the direction in which every entry of the parameter grows alike.
+    """
+    si, bs, _ = sample(bsdf, view, count)
+    wo = dr.detach(bs.wo)
+    params = mi.traverse(bsdf)
+
+    def value() -> mi.Float:
+        dr.enable_grad(params[key])
+        params.update()
+        return dr.sum(intensity(bsdf.eval(mi.BSDFContext(), si, wo)), axis=None)
+
+    total = value()
+    dr.backward(total)
+    reverse = dr.sum(dr.grad(params[key]), axis=None)
+    params[key] = dr.detach(params[key])
+    total = value()
+    dr.forward(params[key])
+    forward = dr.grad(total)
+    assert dr.isfinite(reverse) and reverse != 0
+    # The two modes sum the same float32 terms of either sign in different orders.
+    assert dr.allclose(forward, reverse, rtol=1e-3), (forward, reverse)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Parameters
+# --------------------------------------------------------------------------------------------------
+
+# Values that no plugin with a map may take, and the parameter that the error names.
+NAN = float("nan")
+BAD_PARAMETERS = [
+    ({"wrap_mode": "tile"}, "wrap_mode"),
+    ({"wrap_mode": 1}, "wrap_mode"),
+    ({"map_type": "bump"}, "map_type"),
+    ({"height_scale": NAN}, "height_scale"),
+    ({"footprint_sigma": -0.5}, "footprint_sigma"),
+    ({"footprint_sigma": NAN}, "footprint_sigma"),
+    ({"footprint_sigma": float("inf")}, "footprint_sigma"),
+    ({"footprint_sigma": "0.5"}, "footprint_sigma"),
+    ({"footprint_sigma": True}, "footprint_sigma"),
+    ({"pixel_spread": -1e-3}, "pixel_spread"),
+    ({"pixel_spread": NAN}, "pixel_spread"),
+    ({"material": "Unobtainium"}, "material"),
+    ({"material": 3}, "material"),
+    ({"material": "Au", "eta": 0.2}, "material"),
+    ({"material": "Au", "int_ior": 1.5}, "material"),
+    ({"k": 1.0, "ext_ior": 1.0}, "ext_ior"),
+    ({"eta": -0.2}, "eta"),
+    ({"k": NAN}, "k"),
+    ({"eta": "gold"}, "eta"),
+    ({"int_ior": 0.0}, "int_ior"),
+    ({"int_ior": NAN}, "int_ior"),
+    ({"ext_ior": "ether"}, "ext_ior"),
+    ({"specular_reflectance": 1.5}, "specular_reflectance"),
+    ({"specular_reflectance": -0.5}, "specular_reflectance"),
+    ({"specular_reflectance": NAN}, "specular_reflectance"),
+    ({"to_uv": 2.0}, "to_uv"),
+    ({"filename": "map.exr"}, "filename"),  # besides the data of the map
+    ({"data": (1.0, 2.0, 3.0)}, "data"),
+    ({"data": None, "filename": "does_not_exist.exr"}, "filename"),
+    ({"data": None, "filename": 3}, "filename"),
+    ({"data": None, "bitmap": "map.exr"}, "bitmap"),
+    ({"data": None}, "data"),
+]
+
+
+def check_rejects(good: dict, changes: dict, parameter: str) -> None:
+    """Loading ``good`` with ``changes`` (None: left out) fails and names plugin and parameter."""
+    description = {k: v for k, v in {**good, **changes}.items() if v is not None}
+    try:
+        mi.load_dict(description)
+    except Exception as error:
+        sentence = rf'{good["type"]}: .*"{parameter}".* \(got .*\)'
+        assert re.search(sentence, str(error)), f"{changes}: {error}"
+    else:
+        raise AssertionError(f"{changes} is accepted")

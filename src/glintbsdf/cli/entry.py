@@ -1,0 +1,379 @@
+"""The command line: ``glintbsdf render``, ``pndf``, ``inspect``, ``synthesise`` and ``doctor``.
+
+Only what concerns the terminal is here; the work is done in other modules.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+import click
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf import __version__
+from glintbsdf.bridge import llvm
+from glintbsdf.check import plot as pndf_plot
+from glintbsdf.cli.doctor import examine
+from glintbsdf.core.progress import progress
+from glintbsdf.maps import quilting as synthesis
+from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
+from glintbsdf.scene import inspection, rendering
+
+Definitions = tuple[str, ...]
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+
+def main() -> NoReturn:
+    """Run the command line. Errors are one line on stderr; ``--debug`` shows where they come from.
+
+    Exit status: 0 done, 1 failed, 2 wrong usage.
+    """
+    debug = "--debug" in sys.argv[1:]
+    try:
+        with interruptible():
+            status = commands.main(prog_name="glintbsdf", standalone_mode=False)
+        sys.exit(status if isinstance(status, int) else 0)
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit("Aborted.")
+    except click.ClickException as error:
+        click.echo(f"Error: {one_line(error.format_message())}", err=True)
+        sys.exit(error.exit_code)
+    except Exception as error:
+        if debug:
+            raise
+        sys.exit(f"Error: {one_line(str(error)) or type(error).__name__}")
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C end the block as KeyboardInterrupt, whatever the libraries below make of it.
+
+    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error
+    of their own in its place.
+    """
+    received = False
+
+    def receive(number: int, frame: object) -> None:
+        nonlocal received
+        received = True
+        signal.default_int_handler(number, frame)
+
+    previous = signal.signal(signal.SIGINT, receive)
+    try:
+        yield
+    except Exception as error:
+        if received:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def one_line(message: str) -> str:
+    """Return an error message without the Python traceback and the place in Mitsuba's sources.
+
+    Mitsuba wraps the error of a Python plugin in its own message, traceback included.
+    """
+    message = re.sub(r"^\[\w+\.cpp:\d+\] ", "", message)
+    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+(?:[\w.]+: )?", "", message)
+    return " ".join(message.split())
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="glintbsdf")
+@click.option("--debug", is_flag=True, help="Show the Python traceback of an error.")
+def commands(debug: bool) -> None:
+    """Glint BSDFs for Mitsuba 3."""
+
+
+# ---------------------------------------------------------------------------------------------
+#  Options that commands share
+# ---------------------------------------------------------------------------------------------
+
+
+def _activate(variant: str) -> None:
+    """Choose a Mitsuba variant; what prevents it is told before Dr.Jit can abort the process."""
+    known = [name for name in mi.variants() if not name.startswith("scalar")]
+    if variant not in known:
+        raise click.BadParameter(
+            f'must be one of {", ".join(known)} (got "{variant}")', param_hint="-m"
+        )
+    if variant.startswith("llvm"):
+        llvm.require_usable()
+    elif not dr.has_backend(dr.JitBackend.CUDA):
+        raise click.ClickException(
+            f"{variant} needs an NVIDIA GPU and its driver, and Dr.Jit finds none. "
+            f"On the CPU: -m {DEFAULT_VARIANT}"
+        )
+    mi.set_variant(variant)
+
+
+def _parse_definitions(
+    _context: click.Context, _parameter: click.Parameter, values: Definitions
+) -> dict[str, str]:
+    """Turn ``("a=1", "b=2")`` into a dictionary of strings."""
+    pairs = [value.partition("=") for value in values]
+    for value, (key, equals, _) in zip(values, pairs, strict=True):
+        if not key or not equals:
+            raise click.BadParameter(f'must be key=value (got "{value}")')
+    return {key: value for key, _, value in pairs}
+
+
+def _parse_output(
+    _context: click.Context, _parameter: click.Parameter, path: Path | None
+) -> Path | None:
+    """Accept only names of image files that can be written."""
+    if path is not None and path.suffix.lower() not in rendering.FORMATS:
+        allowed = " or ".join(rendering.FORMATS)
+        raise click.BadParameter(f'must end in {allowed} (got "{path}")')
+    return path
+
+
+def _parse_exr(_context: click.Context, _parameter: click.Parameter, path: Path) -> Path:
+    """Accept only names of OpenEXR files."""
+    if path.suffix.lower() != ".exr":
+        raise click.BadParameter(f'must end in .exr (got "{path}")')
+    return path
+
+
+_variant_option = click.option(
+    "-m",
+    "variant",
+    metavar="VARIANT",
+    default=DEFAULT_VARIANT,
+    show_default=True,
+    help="Variant of Mitsuba.",
+)
+_file = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+def _define_option(meaning: str):
+    return click.option(
+        "-D",
+        "definitions",
+        metavar="KEY=VALUE",
+        multiple=True,
+        callback=_parse_definitions,
+        help=meaning,
+    )
+
+
+# ---------------------------------------------------------------------------------------------
+#  Commands
+# ---------------------------------------------------------------------------------------------
+
+
+@commands.command()
+@click.argument("scene", type=_file)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_output,
+    help="Image to write, .exr or .png.  [default: SCENE.exr]",
+)
+@_variant_option
+@click.option(
+    "--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]"
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
+@click.option(
+    "--denoise",
+    is_flag=True,
+    help="Denoise the indirect light; direct light, and so all glints, stay as they are. Needs the "
+    'integrator "glint_path".',
+)
+@click.option(
+    "--trim",
+    is_flag=True,
+    help="Build no more of the maps' structures than the scene asks for, which a survey with few "
+    "samples finds out. The image is the same.",
+)
+@_define_option("Parameter of the scene; may be repeated.")
+def render(
+    scene: Path,
+    output: Path | None,
+    variant: str,
+    spp: int | None,
+    seed: int,
+    denoise: bool,
+    trim: bool,
+    definitions: dict[str, str],
+) -> None:
+    """Render the Mitsuba scene SCENE to an image.
+
+    The footprint of glint BSDFs that leave "pixel_spread" at 0 is that of the camera's pixels.
+    """
+    _activate(variant)
+    path = output or scene.with_suffix(".exr")
+    with rendering.replacing(path) as unfinished:
+        if trim:
+            bitmap = _render_trimmed(scene, definitions, spp, seed, denoise)
+        else:
+            # Plugins show the progress of what they build while the scene loads.
+            loaded = rendering.load_scene(scene, definitions)
+            with progress("Rendering") as report:
+                bitmap = rendering.render(loaded, spp, seed, report, denoise)
+        rendering.save(bitmap, unfinished)
+    click.echo(path)
+
+
+def _render_trimmed(
+    scene: Path, definitions: dict[str, str], spp: int | None, seed: int, denoise: bool
+) -> mi.Bitmap:
+    """Render by structures that a survey has trimmed, and tell where they have not sufficed."""
+    inspected = inspection.load(scene, definitions)
+
+    def render(check) -> mi.Bitmap:
+        with progress("Rendering") as report:
+            return rendering.render(
+                inspected.scene, spp, seed, lambda done: (check(), report(done)), denoise
+            )
+
+    bitmap, sufficed = inspection.render_trimmed(inspected, render, spp)
+    if not sufficed:
+        click.echo("Trimmed structures did not suffice: built in full, rendered again.", err=True)
+    return bitmap
+
+
+@commands.command()
+@click.argument("scene", type=_file)
+@_variant_option
+@click.option(
+    "--spp",
+    type=click.IntRange(min=1),
+    help="Samples per pixel, on which footprints depend.  [default: the scene's]",
+)
+@_define_option("Parameter of the scene; may be repeated.")
+def inspect(scene: Path, variant: str, spp: int | None, definitions: dict[str, str]) -> None:
+    """Report what the glint BSDFs of the Mitsuba scene SCENE are asked for, and what they build.
+
+    The part of each map and the sizes of footprints are what paths of the scene's own sensor and
+    integrator have met, later bounces included; "--trim" is what "render --trim" would build.
+    """
+    _activate(variant)
+    findings = inspection.inspect(inspection.load(scene, definitions), spp)
+    click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")
+
+
+@commands.command()
+@click.option("--type", "plugin", required=True, metavar="TYPE", help="Type of the glint BSDF.")
+@click.option("--map", "map_file", type=_file, required=True, help="Normal or height map.")
+@click.option("--uv", type=(float, float), required=True, help="Centre of the footprint.")
+@click.option(
+    "--sigma",
+    type=click.FloatRange(min=0),
+    required=True,
+    metavar="TEXELS",
+    help="Standard deviation of the footprint in texels.",
+)
+@click.option(
+    "--res",
+    type=click.IntRange(2, 4096),
+    default=256,
+    show_default=True,
+    help="Pixels of a drawing along each axis.",
+)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_output,
+    default="pndf.png",
+    show_default=True,
+    help="Drawing to write.",
+)
+@_variant_option
+@_define_option("Parameter of the BSDF; may be repeated.")
+def pndf(
+    plugin: str,
+    map_file: Path,
+    uv: tuple[float, float],
+    sigma: float,
+    res: int,
+    output: Path,
+    variant: str,
+    definitions: dict[str, str],
+) -> None:
+    """Draw a P-NDF beside its reference.
+
+    Left the plugin's density over the disk of normals, right the same by counting samples; printed
+    are the relative L1 difference, the part of it that is the noise of the reference, and the time.
+    """
+    _activate(variant)
+    with rendering.replacing(output) as unfinished:
+        comparison = pndf_plot.compare(plugin, map_file, uv, sigma, res, definitions)
+        rendering.save(comparison.drawing(), unfinished)
+    click.echo(comparison)
+    click.echo(output)
+
+
+@commands.command()
+@click.argument("sample", type=_file)
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_exr,
+    required=True,
+    help="Map to write, .exr.",
+)
+@click.option("--output-size", type=int, default=4096, show_default=True, help="Its texels.")
+@click.option("--patch-size", type=int, default=64, show_default=True, help="Texels of a patch.")
+@click.option("--overlap", type=int, help="Texels patches share; a tenth of a patch's.")
+@click.option(
+    "--balance",
+    type=float,
+    default=0.9,
+    show_default=True,
+    help="Weight of normals against their Jacobians.",
+)
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--wrap-mode",
+    type=click.Choice(WRAP_MODES),
+    default="repeat",
+    show_default=True,
+    help="To repeat, the map is made to fit to itself.",
+)
+@click.option("--map-type", type=click.Choice(MAP_TYPES), default="auto", show_default=True)
+@click.option("--height-scale", type=float, default=1.0, show_default=True)
+def synthesise(
+    sample: Path,
+    output: Path,
+    wrap_mode: str,
+    map_type: str,
+    height_scale: float,
+    **options: float,
+) -> None:
+    """Make a large normal map from the small normal or height map SAMPLE.
+
+    It is the map of glint_mip with the same parameters, which does not need it to be stored.
+    """
+    normal_map = NormalMap.load(sample, map_type, height_scale, wrap_mode, "synthesise")
+    with rendering.replacing(output) as unfinished:
+        made = synthesis.synthesise(normal_map, **options, toroidal=wrap_mode == "repeat")
+        made.write(unfinished)
+    click.echo(made)
+    click.echo(output)
+
+
+@commands.command()
+@click.pass_context
+def doctor(context: click.Context) -> None:
+    """Report what is installed, what runs, and how to get what is missing."""
+    findings = examine()
+    width = max(len(finding.name) for finding in findings)
+    for finding in findings:
+        click.echo(f"{finding.name:<{width}}  {finding.value}")
+        if finding.remedy:
+            click.echo(f"{'':<{width}}  -> {finding.remedy}")
+    context.exit(1 if any(finding.fatal for finding in findings) else 0)

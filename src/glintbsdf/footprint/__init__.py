@@ -1,0 +1,1 @@
+"""The footprint of a pixel: its Gaussian, kernels on the lattice of texels, ray cones."""

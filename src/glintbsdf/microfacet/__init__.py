@@ -1,0 +1,1 @@
+"""The microfacet frame around a distribution of normals."""

@@ -1,0 +1,1 @@
+"""Position-normal Gaussian elements (Yan, Hašan, Marschner and Ramamoorthi 2016)."""

@@ -1,0 +1,622 @@
+"""The P-NDF of position-normal Gaussian elements.
+
+Yan, Hašan, Marschner and Ramamoorthi, "Position-Normal Distributions for Efficient Rendering of
+Specular Microstructure" (2016), section 5. Seeds on a lattice of step h carry Gaussians in
+position × normal space, flat (Eq. 12) or aligned with the map's curvature (Eq. 13); the P-NDF is
+their mixture seen through the footprint (Eq. 11), in the stable form of
+:mod:`~glintbsdf.pndf.gaussian_elements`.
+
+Beyond the paper: the mixture is divided by its mass under the footprint, in closed form, so that it
+integrates to one; and the sampler draws from exactly this density.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from math import ceil, exp, inf, pi, sqrt
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.cache import load_or_build
+from glintbsdf.core.errors import check
+from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import TexelKernel
+from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
+from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
+from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
+from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
+
+#: Of the lists; part of their name in the cache.
+VERSION = 6
+
+#: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
+FEW_CELLS = 25
+
+#: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
+#: what large footprints skip: small ones sum without a cut.
+NORMAL_REACH = 3.94
+
+#: Bounds of the roughness. Half vectors in float32 are 6e-8 apart: below 1e-7 there is only noise,
+#: and determinants underflow from 1e-9 on.
+MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
+
+#: Seeds per cell along an axis, at most: the loop over those of a cell is unrolled.
+MAX_SEEDS = 4
+
+#: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
+#: takes 430 of its 1120 MB then at a step of half a texel, and 170 at one texel.
+BYTES_PER_CELL = 42, 96
+
+#: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
+MAX_ATTEMPTS = 128
+
+
+#: Elements fade in ρ², the squared Mahalanobis distance from the footprint's centre in N(0, T),
+#: over this width until they are cut.
+FADE = 2.0
+
+
+def cut_of_sums(sigma: mi.Float, point_cut: float) -> mi.Float:
+    """ρ² of the cut where all elements are summed, and with them W: any cut keeps ∫D = 1.
+
+    ``sigma`` is the minor standard deviation of T, in steps. A large footprint is cut as that of
+    other kernels, half of the fade within 3 standard deviations, half beyond; a point at
+    ``point_cut``.
+    """
+    return 10 + (point_cut - 10) * SIGMA_H**2 / dr.square(sigma)
+
+
+def cut_of_lists(sigma: mi.Float) -> mi.Float:
+    """ρ² of the cut where W is known in closed form: its ripple stays below 5e-4."""
+    return 10 + 3.5 * dr.maximum(dr.log2(2.5 / sigma), 0)
+
+
+def mass_under_fade(cut: mi.Float) -> mi.Float:
+    """What is left of a Gaussian that fades until it is cut at ρ² = ``cut``."""
+    return 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
+
+
+class SeedAxis:
+    """Seeds along one axis of a map of ``texels`` texels, about ``step`` texels apart.
+
+    Seeds are grouped in cells. Where a whole number of steps makes a texel, a cell is the span
+    between two texel centres, which all its seeds interpolate; else it is a step with one seed.
+    The step is rounded so that a whole number of cells makes the map.
+
+    Attributes:
+        seeds (int): seeds per cell.
+        cells (int): cells per map.
+        cell (float): side of a cell, texels. Cell k begins k sides after the first texel's centre.
+        offset (float): the first seed's place in a cell, in cells.
+    """
+
+    def __init__(self, texels: int, step: float) -> None:
+        per_texel = round(1 / step)
+        aligned = 1 <= per_texel <= MAX_SEEDS and abs(per_texel * step - 1) < 1e-6
+        self.texels = texels
+        self.seeds = per_texel if aligned else 1
+        self.cells = texels if aligned else max(1, round(texels / step))
+        self.cell = texels / self.cells
+        # One seed to a texel or less: midway between texel centres, where bilinear interpolation
+        # has no kink.
+        self.offset = 0.5 / self.seeds if self.cell <= 1 else 0.5 / self.cell
+
+    @property
+    def places(self) -> list[float]:
+        """Places of the seeds in a cell."""
+        return [self.offset + k / self.seeds for k in range(self.seeds)]
+
+    @property
+    def inner_cells(self) -> int:
+        """Cells of a clamped map: those that begin before its last texel's centre, and one."""
+        return ceil((self.texels - 1) / self.cell) + 1
+
+    def cell_of(self, seed: mi.Int) -> tuple[mi.Int, mi.Float]:
+        """The cell of a seed, and the seed's place in it."""
+        cell = floor_int((mi.Float(seed) + 0.5) * (1 / self.seeds))
+        return cell, dr.fma(1 / self.seeds, mi.Float(seed - cell * self.seeds), self.offset)
+
+    def texel(self, cell: mi.UInt32, place: mi.Float, wrap_mode: str) -> tuple[mi.Int, mi.Float]:
+        """The quad of texels, as stored, that holds a place in a stored cell, and where."""
+        clamped = wrap_mode == "clamp"
+        position = (mi.Float(cell) - (BLOCK if clamped else 0) + place) * self.cell
+        if clamped:  # the map is constant beyond its border
+            position = dr.clip(position, -1, self.texels - 0.5)
+        texel = dr.floor(position)
+        return mi.Int(texel) + (BLOCK if clamped else 0), position - texel
+
+
+class Mixture:
+    """A P-NDF of Gaussian elements on a lattice of cells; what all kinds of them share.
+
+    A subclass sets
+
+    Attributes:
+        lattice (Lattice): the cells, with ``map_cells`` (columns, rows) of them to a map.
+        lists (QuadLists): the cells whose elements may show a normal; None where all footprints
+            are small.
+        variance (float): of S, cells².
+        sigma_r (mi.Float): standard deviation σ_r of the normals of a flat element.
+        wrap_mode (str): what lies beyond the map.
+
+    and implements the methods that raise ``NotImplementedError`` here.
+    """
+
+    #: ρ² of the cut where the footprint is a point: its elements are interpolated there, and the
+    #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
+    point_cut = 4.0
+
+    #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
+    origin = (0.0, 0.0)
+
+    def seen(self, kernel: TexelKernel) -> Callable:
+        """What the footprint makes of elements, as a function ``(m, row, column, corner, active)``.
+
+        It lists the elements of a stored cell, whose ``corner`` is given from the footprint's
+        centre (cells): of each its area (cells), ρ² of its place, the peak of its normals'
+        density, and the squared Mahalanobis distance of the projected normal ``m`` from them.
+        """
+        raise NotImplementedError
+
+    def is_small(self, kernel: TexelKernel, steps: mi.Float) -> mi.Bool:
+        """Whether to sum all elements under the footprint, and with them W; ``steps`` is its minor
+        standard deviation in steps from one element to the next."""
+        raise NotImplementedError
+
+    def sum_all(self, kernel: TexelKernel, add: Callable, active, zero):
+        """Sum over all cells with elements under the footprint; see :func:`every_quad`."""
+        raise NotImplementedError
+
+    def mass(self, kernel: TexelKernel) -> mi.Float:
+        """W: mass of all elements under a large footprint, without a cut."""
+        raise NotImplementedError
+
+    def draw_seed(self, position, random_x, random_y, active) -> tuple:
+        """Draw an element in proportion to its Gaussian at ``position`` (cells).
+
+        Returns the indices of its seed, its place (cells), and the probability with which it is
+        to be accepted.
+        """
+        raise NotImplementedError
+
+    def element(self, x, y, active) -> tuple:
+        """Normal and Jacobian of the seed with these indices."""
+        raise NotImplementedError
+
+    def weights(self, footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
+        """N(0, T), which weighs the elements, in cells; whether to sum all that it covers; and ρ²
+        of its cut."""
+        columns, rows = self.map_cells
+        added = (self.variance, self.variance)
+        kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
+        kernel.mean = kernel.mean - mi.Vector2f(*self.origin)
+        steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
+        cut = cut_of_sums(steps, self.point_cut)
+        kernel.cut_at(dr.sqrt(cut))
+        few = self.is_small(kernel, steps)
+        cut = dr.select(few, cut, cut_of_lists(steps))
+        kernel.cut_at(dr.sqrt(cut))
+        return kernel, few, cut
+
+    def overlap(self, kernel: TexelKernel) -> Overlap:
+        """What the footprint sees of every element."""
+        return Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=self.variance))
+
+    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it.
+
+        ``footprint``: a :class:`~.Footprint`, in the UV space of the map.
+        """
+        kernel, few, cut = self.weights(footprint)
+        seen = self.seen(kernel)
+        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+
+        def share(area, near):
+            return area * dr.clip((cut - near) * (1 / FADE), 0, 1)
+
+        def add(density, *cell):
+            total = mi.Float(0)
+            for area, near, peak, alike in seen(m, *cell):
+                weight = share(area, near) * peak
+                total = dr.fma(weight, dr.exp(-0.5 * (near + alike)), total)
+            return density + dr.select(cell[-1], total, 0)
+
+        def add_both(sums, *cell):
+            total = mi.Vector2f(0)
+            for area, near, peak, alike in seen(m, *cell):
+                weight = share(area, near) * dr.exp(-0.5 * near)
+                total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * alike), weight)
+            return sums + dr.select(cell[-1], total, 0)
+
+        density, mass = self.sum_all(kernel, add_both, active & few, mi.Vector2f(0))
+        if self.lists is not None:
+            listed = active & ~few & self.lists.covers(m)
+            density = density + self.lists.visit(m, kernel, add, listed)
+        gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
+        gaussian = gaussian * mass_under_fade(cut)
+        mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
+        return density / mass
+
+    def sample(
+        self, footprint, sample1: mi.Float, sample2: mi.Point2f, active: bool | mi.Bool = True
+    ) -> mi.Vector2f:
+        """Draw a projected normal with density D.
+
+        An element is drawn in proportion to its mass N(d; 0, T) under the footprint: a point u of
+        the footprint, then an element seen there, accepted such that the mass seen there, which
+        differs from point to point, does not count. Then a normal of this element. The random
+        numbers of all but the first point are a hash of the samples.
+
+        A normal outside the disk is an invalid sample, as D is 0 there.
+        """
+        kernel, _, cut = self.weights(footprint)
+        bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
+
+        def attempt(count, x, y, offset, active):
+            first, second = (
+                [uniform(b) for b in pcg3d(bits[0], bits[1], bits[2] + 3 * count + k)]
+                for k in (0, 1)
+            )
+            point = dr.select(count == 0, mi.Point2f(sample2), mi.Point2f(first[0], first[1]))
+            point = mi.warp.square_to_std_normal(point)
+            position = kernel.mean + kernel.du * point.x + kernel.dv * point.y
+            x, y, place, probability = self.draw_seed(position, second[0], second[1], active)
+            offset = mi.Vector2f(place - kernel.mean)
+            fade = (cut - dr.squared_norm(kernel.whitened(offset))) * (1 / FADE)
+            accepted = second[2] < probability * dr.minimum(fade, 1)
+            count = count + 1
+            return count, x, y, offset, active & ~accepted & (count < MAX_ATTEMPTS)
+
+        with dr.suspend_grad():
+            count, x, y, offset, _ = dr.while_loop(
+                (mi.UInt32(0), mi.Int(0), mi.Int(0), mi.Vector2f(0), mi.Bool(active)),
+                lambda *state: state[-1],
+                attempt,
+                label="element",
+            )
+        normal, jacobian = self.element(x, y, active)
+        mean, distribution = normal, Gaussian(variance=dr.square(self.sigma_r))
+        if jacobian is not None:
+            overlap = self.overlap(kernel)
+            mean = normal - jacobian @ overlap.mean(offset)
+            distribution = overlap.normals(jacobian, distribution)
+        random = pcg3d(bits[0], bits[1], bits[2] + 3 * count + 2)
+        z = mi.warp.square_to_std_normal(mi.Point2f(uniform(random[0]), uniform(random[1])))
+        return mean + distribution.sample(mi.Vector2f(z))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of elements and lists, bytes."""
+        return sum(self.parts.values())
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        lists = 0 if self.lists is None else self.lists.nbytes
+        return {"elements": self.element_bytes, "lists of elements": lists}
+
+
+def draw_neighbour(x, random):
+    """Draw an integer k in proportion to N(x − k; 0, σ_h²).
+
+    Returns k, and the sum of these densities over all k.
+    """
+    first = dr.floor(x) - 2
+    # Six integers: what lies beyond weighs less than 1e-10.
+    weights = [dr.exp((-0.5 / SIGMA_H**2) * dr.square(x - first - k)) for k in range(6)]
+    total = sum(weights)
+    left, k = random * total, mi.Float(0)
+    for weight in weights[:-1]:
+        left = left - weight
+        k = k + dr.select(left >= 0, 1, 0)
+    return mi.Int(first + k), total * (1 / (SIGMA_H * sqrt(2 * pi)))
+
+
+#: The largest sum of :func:`draw_neighbour`, that at an integer.
+DENSEST = sum(exp(-0.5 * (k / SIGMA_H) ** 2) for k in range(-3, 4)) / (SIGMA_H * sqrt(2 * pi))
+
+
+class Elements(Mixture):
+    """Elements of a normal map, and their exact sampler.
+
+    Nothing is stored per element: its normal and Jacobian come from the four texels around it.
+    Belongs to the variant of Mitsuba that is active when it is made.
+
+    Args:
+        normal_map (NormalMap): the map; between texel centres, normals are those of the triangle
+            mesh of :mod:`~glintbsdf.reference`.
+        sigma_r (float): intrinsic roughness σ_r, the standard deviation of a projected normal.
+        step (float): h, texels from one seed to the next. It is rounded so that a whole number of
+            steps makes the map.
+        curved (bool): whether elements follow the map's Jacobian (Eq. 13) or are flat (Eq. 12).
+        owner (str): whom errors name, usually the plugin.
+        reach (Reach): what will be asked; None for anything. Where all footprints are summed cell
+            by cell, no lists are made; within the reach D is the same to the last bit.
+
+    Attributes:
+        data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it and through
+            ``sigma_r``; after a change of values, :meth:`parameters_changed` rebuilds what depends
+            on them.
+
+    Raises :class:`~.ParameterError`.
+    """
+
+    # What others ask a P-NDF of a normal map for: roughness makes a clamp needless.
+    kernel, epsilon = "gaussian", 0.0
+
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        sigma_r: float = 0.005,
+        step: float = 0.5,
+        curved: bool = True,
+        owner: str = "Elements",
+        reach: Reach | None = None,
+    ) -> None:
+        check_sigma_r(owner, sigma_r)
+        check(0 < step < inf, owner, "step", "a finite number > 0", step)
+        self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
+        self.wrap_mode, self.reach = normal_map.wrap_mode, reach
+        self.data = mi.TensorXf(normal_map.normals)
+        self.sigma_r = mi.Float(sigma_r)
+        key = f"elements {VERSION} {normal_map.content_hash} {sigma_r!r} {step!r} {curved}"
+        self.build(lambda build: load_or_build(key, build))
+
+    def build(self, cached=lambda build: build()) -> None:
+        """Make everything that depends on ``data`` and ``sigma_r``."""
+        height, width, _ = self.data.shape
+        self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
+        self.map_cells, self.seeds = (x.cells, y.cells), x.seeds
+        self.variance = (SIGMA_H / self.seeds) ** 2
+        self.origin = tuple(0.5 / axis.cell - 0.5 for axis in self.axes)
+
+        self.texels = Lattice(height, width, self.wrap_mode)
+        self.vertices = dr.ravel(
+            dr.gather(mi.Vector2f, self.data.array, mi.UInt32(self.texels.source))
+        )
+        dr.eval(self.vertices)
+        self.element_bytes = 4 * dr.width(self.vertices)
+        self.aligned = self.map_cells == (width, height)
+        self.lattice = self.texels
+        if not self.aligned:
+            clamped = self.wrap_mode == "clamp"
+            cells = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
+            self.lattice = Lattice(*cells, self.wrap_mode)
+
+        # By the side of the diagonal, so that elements with the same Jacobian are neighbours.
+        self.places = sorted(
+            ((u, v) for v in y.places for u in x.places),
+            key=lambda place: side_of_diagonal(*place),
+        )
+        self.anchors = self.places
+        if self.aligned and self.curved:
+            self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
+        self.lists = None
+        if self.reach is None or not self.all_small(self.reach.largest):
+            self.lists = QuadLists(self.lattice, cached(self.build_lists))
+
+    def all_small(self, sigma: float) -> bool:
+        """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
+        cell: the round one of this size covers most cells."""
+        height, width, _ = self.data.shape
+        largest = Footprint(
+            mi.Point2f(0), mi.Vector2f(sigma / width, 0), mi.Vector2f(0, sigma / height)
+        )
+        return bool(dr.all(self.weights(largest)[1]))
+
+    # --------------------------------------------------------------------------------------------
+    #  The elements
+    # --------------------------------------------------------------------------------------------
+
+    def corner_normals(self, row, column, active):
+        """Projected normals n0…n3 around a stored quad of texels."""
+        return self.texels.corner_values(self.vertices, row, column, active)
+
+    def located(self, row, column, x, y):
+        """The quad of texels that holds the place (``x``, ``y``) of a stored cell, and where.
+
+        Returns row and column as stored, and the place in the quad.
+        """
+        if self.aligned:
+            return row, column, x, y
+        column, x = self.axes[0].texel(column, x, self.wrap_mode)
+        row, y = self.axes[1].texel(row, y, self.wrap_mode)
+        return row, column, x, y
+
+    def jacobian(self, normals, side):
+        """The mesh's Jacobian, per cell, on this side of a quad's diagonal; None if flat."""
+        if not self.curved:
+            return None
+        n0, n1, n2, n3 = normals
+        along_x = mixed(n1 - n0, n3 - n2, side) * self.axes[0].cell
+        along_y = mixed(n2 - n0, n3 - n1, side) * self.axes[1].cell
+        return mi.Matrix2f(along_x.x, along_y.x, along_x.y, along_y.y)
+
+    def elements(self, row, column, active):
+        """The elements of a stored cell, in the order of ``places``.
+
+        Of each, the mesh's normal at the element's anchor, a place in the cell, and its Jacobian
+        (``mi.Matrix2f``, per cell), None for a flat one.
+        """
+        row, column, *inside = self.located(row, column, *self.places[0])
+        normals = self.corner_normals(row, column, active)
+        if not self.aligned:
+            jacobian = self.jacobian(normals, side_of_diagonal(*inside))
+            return [(normal_at(normals, *inside), jacobian)]
+        sides = [side_of_diagonal(*place) for place in self.places]
+        jacobians = {side: self.jacobian(normals, side) for side in set(sides)}
+        if not self.curved:
+            return [(normal_at(normals, *place), None) for place in self.places]
+        return [(normals[ANCHORS[side][1]], jacobians[side]) for side in sides]
+
+    def seen(self, kernel):
+        roughness = Gaussian(variance=dr.square(self.sigma_r))
+        overlap = self.overlap(kernel)
+        area = 1 / len(self.places)
+        # What does not depend on the cell.
+        whitened = [kernel.whitened(mi.Vector2f(*place)) for place in self.places]
+        steps = [
+            overlap.gain @ mi.Vector2f(*place) - mi.Vector2f(*place) + mi.Vector2f(*anchor)
+            for place, anchor in zip(self.places, self.anchors, strict=True)
+        ]
+
+        def seen(m, row, column, corner, active):
+            white_corner, step = kernel.whitened(corner), overlap.gain @ corner
+            distribution, of = roughness, None
+            for k, (normal, jacobian) in enumerate(self.elements(row, column, active)):
+                delta = m - normal
+                if jacobian is not None:
+                    # m − (s_i + J μ): the normal is that of the anchor, and μ = −S T⁻¹ offset.
+                    delta = delta + jacobian @ (step + steps[k])
+                    if jacobian is not of:
+                        distribution, of = overlap.normals(jacobian, roughness), jacobian
+                near = dr.squared_norm(white_corner + whitened[k])
+                yield area, near, distribution.peak, distribution.distance_squared(delta)
+
+        return seen
+
+    def is_small(self, kernel, steps):
+        return kernel.touched_quads() <= FEW_CELLS
+
+    def sum_all(self, kernel, add, active, zero):
+        return every_quad(self.lattice, kernel, add, active, zero)
+
+    def element(self, x, y, active):
+        cells, places = zip(
+            *(axis.cell_of(seed) for axis, seed in zip(self.axes, (x, y), strict=True)),
+            strict=True,
+        )
+        column, row = self.lattice.x.locate(cells[0])[1], self.lattice.y.locate(cells[1])[1]
+        row, column, *inside = self.located(row, column, *places)
+        normals = self.corner_normals(row, column, active)
+        return normal_at(normals, *inside), self.jacobian(normals, side_of_diagonal(*inside))
+
+    def draw_seed(self, position, random_x, random_y, active):
+        offset = mi.Vector2f(*(axis.offset for axis in self.axes))
+        x, mass_x = draw_neighbour((position.x - offset.x) * self.seeds, random_x)
+        y, mass_y = draw_neighbour((position.y - offset.y) * self.seeds, random_y)
+        place = mi.Vector2f(x, y) * (1 / self.seeds) + offset
+        return x, y, place, mass_x * mass_y * (1 / DENSEST**2)
+
+    def mass(self, kernel):
+        x = (kernel.mean - mi.Vector2f(*(axis.offset for axis in self.axes))) * self.seeds
+        scale = self.seeds**2
+        variance_u, variance_v = dr.square(kernel.sigma_u), dr.square(kernel.sigma_v)
+        return lattice_mass(
+            mi.Vector2f(x),
+            scale * variance_u,
+            scale * kernel.shear * variance_v,
+            scale * variance_v,
+        )
+
+    # --------------------------------------------------------------------------------------------
+    #  The lists
+    # --------------------------------------------------------------------------------------------
+
+    def ellipses(self, row, column, active=True):
+        """The ellipses of projected normals in which the elements of a stored cell lie."""
+        with dr.suspend_grad():
+            return tuple(
+                self.ellipse(normal, mi.Vector2f(place) - mi.Vector2f(anchor), jacobian)
+                for (normal, jacobian), place, anchor in zip(
+                    self.elements(row, column, active), self.places, self.anchors, strict=True
+                )
+            )
+
+    def ellipse(self, normal, step, jacobian):
+        """That of an element, ``step`` from its anchor: all of its normals, cut."""
+        spread = ()
+        if jacobian is not None:
+            normal = normal + jacobian @ step
+            sigma = sqrt(self.variance)
+            spread = tuple(mi.Vector2f(jacobian[0, k], jacobian[1, k]) * sigma for k in (0, 1))
+        radii = Gaussian(spread, dr.square(self.sigma_r)).root()
+        return normal, *(NORMAL_REACH * radius for radius in radii)
+
+    def build_lists(self) -> dict[str, np.ndarray]:
+        """The lists of cells by normal."""
+        blocks = BlocksOfEllipses(self.lattice, self.ellipses, len(self.places))
+        normals = self.data.numpy().reshape(-1, 2)
+        return Builder(
+            blocks, normals, self.extent(), BYTES_PER_CELL[len(self.places) > 1]
+        ).arrays()
+
+    def extent(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rectangle (lower, upper) that holds the ellipses of all cells, and a margin.
+
+        In the margin the cells at its border are found: of a flat map, all that is beyond reach.
+        """
+        columns = self.lattice.x.quads
+        index = dr.arange(mi.UInt32, columns * self.lattice.y.quads)
+        boxes = map(BlocksOfEllipses.extent, self.ellipses(index // columns, index % columns))
+        lower, upper = zip(*boxes, strict=True)
+        margin = 1.5 * self.sigma_r
+        lower, upper = reduce(dr.minimum, lower) - margin, reduce(dr.maximum, upper) + margin
+        return tuple(
+            np.array([extreme(v)[0] for v in bound], np.float32)
+            for extreme, bound in ((dr.min, lower), (dr.max, upper))
+        )
+
+    # --------------------------------------------------------------------------------------------
+    #  As a part of a scene
+    # --------------------------------------------------------------------------------------------
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("data", self.data, mi.ParamFlags.Differentiable)
+        callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check new values, and rebuild. Derivatives keep flowing to them."""
+        if keys and not {"data", "sigma_r"} & set(keys):
+            return
+        check_sigma_r(self.owner, self.sigma_r[0])
+        self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner)
+        self.build()
+
+    def __repr__(self) -> str:
+        height, width, _ = self.data.shape
+        return (
+            f"Elements[{width}×{height} texels, {self.wrap_mode}, "
+            f"{'curved' if self.curved else 'flat'}, sigma_r={self.sigma_r[0]:g}, "
+            f"step={self.step:g}, {self.nbytes / 2**20:.1f} MiB]"
+        )
+
+
+#: By the side of a quad's diagonal: a corner at which the mesh has the normal that a Jacobian there
+#: begins from, as a place and as an index.
+ANCHORS = {0.0: ((0, 0), 0), 0.5: ((1, 0), 1), 1.0: ((1, 1), 3)}
+
+
+def side_of_diagonal(x, y):
+    """0 for the place (``x``, ``y``) in the first triangle of a quad, 1 in the second, or ½."""
+    beyond = x + y - 1
+    return dr.select(dr.abs(beyond) < 1e-5, 0.5, dr.select(beyond > 0, 1.0, 0.0))
+
+
+def mixed(first, second, share):
+    """(1 − ``share``) ``first`` + ``share`` ``second``."""
+    if isinstance(share, float) and share in (0, 1):
+        return second if share else first
+    return first + (second - first) * share
+
+
+def normal_at(normals, x, y):
+    """The mesh's normal at the place (``x``, ``y``) of a quad with these corner normals.
+
+    The triangles (n0, n1, n2) and (n3, n2, n1) differ by a kink along their diagonal.
+    """
+    n0, n1, n2, n3 = normals
+    kink = n3 - n2 - (n1 - n0)
+    return n0 + (n1 - n0) * x + (n2 - n0) * y + kink * dr.maximum(x + y - 1, 0)
+
+
+def check_sigma_r(owner: str, sigma_r: float) -> None:
+    """Raise :class:`~.ParameterError` for a roughness that is not allowed."""
+    requirement = f"a number in [{MIN_SIGMA_R:g}, {MAX_SIGMA_R:g}]"
+    check(MIN_SIGMA_R <= sigma_r <= MAX_SIGMA_R, owner, "sigma_r", requirement, sigma_r)

@@ -1,0 +1,259 @@
+"""The P-NDF of metallic flakes: flat elements without a map (Yan et al. 2016, section 5.1)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from math import ceil, inf, pi, sqrt
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.cache import load_or_build
+from glintbsdf.core.errors import ParameterError, check, check_whole
+from glintbsdf.footprint.lattice import BLOCK, Lattice
+from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
+from glintbsdf.pndf.elements.elements import NORMAL_REACH, Mixture, check_sigma_r
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian
+from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
+from glintbsdf.pndf.index.lists import SHIFT, Builder, QuadLists
+
+#: Of what is built; part of its name in the cache.
+VERSION = 2
+
+#: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
+#: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
+EVEN = 2.6
+
+#: Memory that building takes, bytes per flake (measured), and that the lists are allowed.
+BYTES_TO_BUILD, BYTES_OF_LISTS = 600, 42
+
+
+class BlocksOfFlakes(BlocksOfEllipses):
+    """The cells that have a flake."""
+
+    def __init__(self, lattice: Lattice, ellipses, occupied, count: int) -> None:
+        super().__init__(lattice, ellipses, shapes_each=1)
+        self.occupied = occupied
+        self.mean_count = count / (self.rows * self.columns)
+
+    def shapes(self, block_row, block_column, quad, active):
+        exists, ellipses = super().shapes(block_row, block_column, quad, active)
+        row = block_row * BLOCK + (quad >> SHIFT)
+        column = block_column * BLOCK + (quad & (BLOCK - 1))
+        return exists & self.occupied(row, column, exists), ellipses
+
+
+@dataclass
+class Surroundings:
+    """A square around a position, in the role of a kernel: ``reach_v`` (cells) to each side."""
+
+    mean: mi.Point2f
+    reach_v: float
+
+    def row_extent(self, top, bottom):
+        return -self.reach_v, self.reach_v
+
+
+class Flakes(Mixture):
+    """Flat elements scattered over the unit UV square, which repeats, and their exact sampler.
+
+    Seeds are a Poisson-disk pattern; each flake has one normal, drawn from a Beckmann distribution.
+    The flakes share the whole surface: the smaller the footprint, the more it is that of the
+    nearest. Belongs to the variant of Mitsuba that is active when it is made.
+
+    Args:
+        density (float): flakes per unit of UV area, rounded to a whole number ≥ 1.
+        alpha (float): Beckmann roughness of the flakes' normals, ≥ 0.
+        sigma_r (float): intrinsic roughness σ_r of each.
+        seed (int): of the pattern and the normals.
+        owner (str): whom errors name, usually the plugin.
+
+    Raises :class:`~.ParameterError`; for more flakes than memory holds before any
+    is allocated.
+    """
+
+    wrap_mode = "repeat"
+    origin = (-0.5, -0.5)  # cells begin at the border of the square
+    point_cut = 16.0  # reaches 1.7 mean distances, across any gap
+
+    def __init__(
+        self,
+        density: float,
+        alpha: float = 0.2,
+        sigma_r: float = 0.005,
+        seed: int = 0,
+        owner: str = "Flakes",
+    ) -> None:
+        check_sigma_r(owner, sigma_r)
+        check(1 <= density < inf, owner, "flake_density", "a finite number ≥ 1", density)
+        check(0 <= alpha < inf, owner, "flake_alpha", "a finite number ≥ 0", alpha)
+        check_whole(seed, lambda value: value >= 0, owner, "seed", "≥ 0")
+        self.count, self.alpha, self.seed, self.owner = round(density), alpha, seed, owner
+        check_memory(owner, self.count)
+        self.sigma_r = mi.Float(sigma_r)
+
+        key = f"flakes {VERSION} {self.count} {self.alpha!r} {self.seed}"
+        flakes = load_or_build(key, self.scatter)
+        n = cells_for(self.count)
+        self.map_cells = n, n
+        self.variance = (SIGMA_H * n / sqrt(self.count)) ** 2
+        self.lattice = Lattice(n, n, "repeat")
+        self.flakes = mi.Float(flakes["flakes"].ravel())  # x, y, normal x, normal y
+        self.areas = mi.Float(flakes["areas"].ravel())
+        self.densest = float(flakes["densest"])
+        self.element_bytes = 4 * (dr.width(self.flakes) + dr.width(self.areas))
+        self.flake_normals = flakes["flakes"].reshape(-1, 4)[flakes["areas"].ravel() > 0, 2:]
+        self.build(lambda build: load_or_build(f"{key} {sigma_r!r}", build))
+
+    def scatter(self) -> dict[str, np.ndarray]:
+        """Places, areas and normals of the flakes, n×n, by cells; and the largest mass seen."""
+        rng = np.random.default_rng(self.seed)
+        places = poisson_disk(self.count, rng)
+        areas = balanced_areas(places)
+        slopes = rng.normal(scale=self.alpha / sqrt(2), size=places.shape)
+        normals = slopes / np.sqrt(1 + np.square(slopes).sum(axis=-1, keepdims=True))
+        flakes = np.concatenate([np.nan_to_num(places), normals], axis=-1).astype(np.float32)
+        return {"flakes": flakes, "areas": areas, "densest": np.array(densest(places, areas))}
+
+    def build(self, cached=lambda build: build()) -> None:
+        """Make everything that depends on ``sigma_r``."""
+        reach = NORMAL_REACH * self.sigma_r[0]
+
+        def ellipses(row, column, active):
+            normal = self.flake(row, column, active)[1]
+            return ((normal, mi.Vector2f(reach, 0), mi.Vector2f(0, reach)),)
+
+        def occupied(row, column, active):
+            return dr.gather(mi.Float, self.areas, self.index(row, column), active) > 0
+
+        blocks = BlocksOfFlakes(self.lattice, ellipses, occupied, self.count)
+        outer = reach + 1.5 * self.sigma_r[0]  # in the margin, the cells at its border are found
+        bounds = self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
+
+        def lists(allowed):
+            return Builder(blocks, self.flake_normals, bounds, allowed).arrays()
+
+        self.lists = QuadLists(self.lattice, cached(lambda: lists(BYTES_OF_LISTS)))
+        # With a single cell of normals: all flakes, block by block.
+        self.all = QuadLists(self.lattice, lists(0))
+
+    def index(self, row, column):
+        return mi.UInt32(row * self.map_cells[0] + column)
+
+    def flake(self, row, column, active):
+        """Place in its cell, and normal, of the flake of a cell."""
+        x, y, normal_x, normal_y = dr.gather(
+            mi.Vector4f, self.flakes, self.index(row, column), active
+        )
+        return mi.Vector2f(x, y), mi.Vector2f(normal_x, normal_y)
+
+    def seen(self, kernel):
+        roughness = Gaussian(variance=dr.square(self.sigma_r))
+
+        def seen(m, row, column, corner, active):
+            place, normal = self.flake(row, column, active)
+            area = dr.gather(mi.Float, self.areas, self.index(row, column), active)
+            near = dr.squared_norm(kernel.whitened(corner + place))
+            yield area, near, roughness.peak, roughness.distance_squared(m - normal)
+
+        return seen
+
+    def is_small(self, kernel, steps):
+        return steps < EVEN
+
+    def sum_all(self, kernel, add, active, zero):
+        return self.all.visit(mi.Vector2f(0), kernel, add, active, zero)
+
+    def mass(self, kernel):
+        return mi.Float(1)
+
+    def draw_seed(self, position, random_x, random_y, active):
+        def add(state, row, column, corner, active):
+            total, left, x, y, offset = state
+            place, _ = self.flake(row, column, active)
+            area = dr.gather(mi.Float, self.areas, self.index(row, column), active)
+            weight = area * dr.exp((-0.5 / self.variance) * dr.squared_norm(corner + place))
+            weight = dr.select(active, weight, 0)
+            total = total + weight
+            share = weight / dr.maximum(total, 1e-30)
+            # A reservoir of one: what is left of the random number decides on the next.
+            taken = left < share
+            left = dr.select(taken, left / share, (left - share) / (1 - share))
+            return (
+                total,
+                left,
+                dr.select(taken, column, x),
+                dr.select(taken, row, y),
+                dr.select(taken, corner + place, offset),
+            )
+
+        surroundings = Surroundings(position, 5 * sqrt(self.variance))
+        state = mi.Float(0), mi.Float(random_x), mi.Int(0), mi.Int(0), mi.Vector2f(0)
+        total, _, x, y, offset = self.all.visit(mi.Vector2f(0), surroundings, add, active, state)
+        return x, y, position + offset, total / (2 * pi * self.variance * self.densest)
+
+    def element(self, x, y, active):
+        return self.flake(y, x, active)[1], None
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check a new roughness, and rebuild."""
+        if not keys or "sigma_r" in keys:
+            check_sigma_r(self.owner, self.sigma_r[0])
+            self.build()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of flakes and lists, bytes."""
+        return super().nbytes + self.all.nbytes
+
+    def __repr__(self) -> str:
+        return (
+            f"Flakes[{self.count} flakes, alpha={self.alpha:g}, sigma_r={self.sigma_r[0]:g}, "
+            f"seed={self.seed}, {self.nbytes / 2**20:.1f} MiB]"
+        )
+
+
+def densest(places: np.ndarray, areas: np.ndarray) -> float:
+    """A bound on the sum of the flakes' Gaussians anywhere, from values on a grid of half cells.
+
+    The sum is smooth over σ_h, which is 0.8 cells: between the grid's points, at most 0.36 cells
+    from the nearest, it exceeds its largest value by less than a tenth.
+    """
+    n = len(places)
+    row, column = np.nonzero(areas)
+    sigma = 2 * SIGMA_H * n / sqrt(len(row))  # in half cells
+    steps = np.arange(-ceil(4 * sigma), ceil(4 * sigma) + 1)
+
+    def spread(cells, offsets):
+        """The grid's points along an axis that a flake reaches, and its Gaussian there."""
+        position = 2 * (cells + offsets)[:, None]
+        points = np.floor(position).astype(np.int64) + steps
+        weights = np.exp((-0.5 / sigma**2) * np.square(points + 0.5 - position))
+        return points.T % (2 * n), weights.T.astype(np.float32)
+
+    offsets, area = places[row, column], areas[row, column]
+    columns, weights_x = spread(column, offsets[:, 0])
+    rows, weights_y = spread(row, offsets[:, 1])
+    total = np.zeros((2 * n, 2 * n), np.float32)
+    for y, weight_y in zip(rows, weights_y, strict=True):
+        for x, weight_x in zip(columns, weights_x, strict=True):
+            # No two flakes are in one half cell: none is added to the same point.
+            total[y, x] += area * weight_y * weight_x
+    return 1.1 * float(total.max()) * 4 / (2 * pi * sigma**2)
+
+
+def check_memory(owner: str, count: int) -> None:
+    """Refuse more flakes than half of the machine's memory can build."""
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+    needed = count * BYTES_TO_BUILD
+    if needed > available:
+        raise ParameterError(
+            f'{owner}: "flake_density" must be at most {available // BYTES_TO_BUILD} on this '
+            f"machine: {count} flakes need {needed / 2**30:.3g} GiB to build, of "
+            f"{available / 2**30:.3g} GiB (got {count})"
+        )

@@ -1,0 +1,392 @@
+"""The smooth filters of normal maps that are in use: one lobe in place of the P-NDF.
+
+Akenine-Möller et al., "Real-Time Rendering" (RTR), 4th edition, 2018, section 9.13.1. Each filter
+keeps some moments of the normals under the footprint (:mod:`glintbsdf.pndf.filters.moments`) and
+turns their averages, with the roughness α of the material between the texels' normals, into a lobe
+(:mod:`glintbsdf.microfacet.slope_distribution`). Where a paper speaks of the variance σ² of slopes,
+α² = 2σ².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.errors import check, check_choice
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels
+from glintbsdf.microfacet.frame import SmithMasking
+from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
+from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
+
+# ------------------------------------------------------------------------------------------------
+#  Moments: functions of projected normals, and products of deviations from the averages of these
+# ------------------------------------------------------------------------------------------------
+
+
+def slope(s) -> list:
+    """``m_xy / m_z`` of the projected normal s."""
+    return list(s * dr.rsqrt(1 - dr.squared_norm(s)))
+
+
+def unit_normal(s) -> list:
+    """The unit normal, as (x, y, 1 − z): near z = 1 no digit is lost."""
+    squared = dr.squared_norm(s)
+    return [s.x, s.y, squared / (1 + dr.sqrt(1 - squared))]
+
+
+#: The variances along the first and the second axis.
+VARIANCES: Spread = (((0, 0),), ((1, 1),))
+
+#: LEAN (Olano and Baker 2010): these, and the covariance.
+COVARIANCE: Spread = (*VARIANCES, ((0, 1),))
+
+#: The sum of the variances of slopes; half of it is what CLEAN keeps (Baker, "Spectacular Specular:
+#: LEAN and CLEAN Specular Highlights", GDC 2011).
+TOTAL: Spread = (((0, 0), (1, 1)),)
+
+#: The same of unit normals: ``1 − l²``, if their mean has the length l.
+TOTAL_3D: Spread = (((0, 0), (1, 1), (2, 2)),)
+
+
+# ------------------------------------------------------------------------------------------------
+#  Lobes: functions of averages of moments, α² and the distribution
+# ------------------------------------------------------------------------------------------------
+
+
+def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """LEAN (Olano and Baker 2010): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``.
+
+    In float32 |Ω| is known to some 1e-7 of the product of both variances: where all slopes lie on
+    one slanting line, lobes of α < 1e-3 are wider or narrower than they should be.
+    """
+    x, y, variance_u, variance_v, cross = averages
+    variance_u, variance_v = positive(variance_u), positive(variance_v)
+    uu, vv, uv = alpha_squared + 2 * variance_u, alpha_squared + 2 * variance_v, 2 * cross
+    # |Ω|, with the determinant of the covariance kept from falling below zero by rounding.
+    determinant = alpha_squared * (alpha_squared + 2 * (variance_u + variance_v)) + 4 * positive(
+        variance_u * variance_v - cross * cross
+    )
+    return SlopeLobe(mi.Vector2f(x, y), uu, vv, uv, determinant, distribution)
+
+
+def clean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """CLEAN (Baker 2011): as LEAN, with the mean of both variances along every direction."""
+    x, y, total = averages
+    return round_lobe(mi.Vector2f(x, y), alpha_squared + positive(total), distribution)
+
+
+def variance_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """Variance mapping (RTR 9.13.1; Hill, SIGGRAPH course 2012): ``α'² = α² + 2 variance`` along u
+    and v.
+
+    The variances are those that the map's MIP levels hold: what lies between samples of the map,
+    and between lookups, is not counted.
+    """
+    x, y, variance_u, variance_v = averages
+    uu, vv = alpha_squared + 2 * positive(variance_u), alpha_squared + 2 * positive(variance_v)
+    return SlopeLobe(mi.Vector2f(x, y), uu, vv, mi.Float(0), uu * vv, distribution)
+
+
+def toksvig_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """Toksvig's (2005), RTR Eq. 9.76: the shorter the mean normal, of length l, the rougher.
+
+    ``α_p' = l α_p / (l + α_p (1 − l))`` for the exponent of Blinn and Phong, which stands for a
+    roughness by ``α_p = 2/α² − 2`` (Walter et al. 2007); RTR uses the same for GGX. Written for α:
+    with k = (1 − l)/l, ``α'² = (α² + 2k (1 − α²)) / (1 + 2k (1 − α²))``.
+    """
+    x, y, shortfall, variance = averages  # shortfall: of z below 1; variance: 1 − l²
+    length = dr.sqrt(x * x + y * y + dr.square(1 - shortfall))
+    k = positive(variance) / ((1 + length) * length)
+    widened = 2 * k * (1 - alpha_squared)
+    alpha_squared = (alpha_squared + widened) / (1 + widened)
+    return lobe_about_normal(mi.Vector2f(x, y) / (1 - shortfall), alpha_squared, distribution)
+
+
+def lobe_about_normal(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """The lobe of an isotropic roughness about a normal of slope b, rather than about the vertical.
+
+    The tangent of a rotation takes a roughness from the plane across that normal to the plane of
+    slopes: ``Ω = α² (1 + |b|²) (I + b bᵀ)``, wider along b than across.
+    """
+    stretch = 1 + dr.squared_norm(mean)
+    scale = alpha_squared * stretch
+    uu, vv = scale * (1 + mean.x * mean.x), scale * (1 + mean.y * mean.y)
+    return SlopeLobe(mean, uu, vv, scale * mean.x * mean.y, scale * scale * stretch, distribution)
+
+
+def round_lobe(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
+    """The lobe of an isotropic roughness."""
+    zero = mi.Float(0)
+    return SlopeLobe(
+        mean, alpha_squared, alpha_squared, zero, dr.square(alpha_squared), distribution
+    )
+
+
+def positive(x):
+    """``x``, or 0 where rounding has made it negative."""
+    return dr.maximum(x, 0)
+
+
+# ------------------------------------------------------------------------------------------------
+#  The methods
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Method:
+    """What a filter averages, whether it counts what lies between lookups, and the lobe it makes of
+    the averages; see :class:`~.MomentPyramid`."""
+
+    moments: Callable
+    spread: Spread
+    lobe: Callable
+    distributions: tuple[str, ...] = ("beckmann",)
+    between: bool = True
+
+
+#: Distributions are those that a method's authors, or RTR, define it for.
+METHODS = {
+    "toksvig": Method(unit_normal, TOTAL_3D, toksvig_lobe, DISTRIBUTIONS),
+    "lean": Method(slope, COVARIANCE, lean_lobe),
+    "clean": Method(slope, TOTAL, clean_lobe),
+    "leadr": Method(slope, COVARIANCE, lean_lobe),  # LEAN with masking and projection
+    "variance": Method(slope, VARIANCES, variance_lobe, DISTRIBUTIONS, between=False),
+}
+
+
+class LobeFootprint(Footprint):
+    """A footprint with the lobe of the normals in it, for those who ask for the lobe repeatedly."""
+
+    def __init__(self, footprint: Footprint, lobe: SlopeLobe) -> None:
+        super().__init__(footprint.uv, footprint.du, footprint.dv)
+        self.lobe = lobe
+
+
+class Filtered:
+    """A P-NDF that is one lobe, by one of the filters of RTR 9.13.1.
+
+    Belongs to the variant of Mitsuba that is active when it is made.
+
+    Args:
+        normal_map (NormalMap): the map; slopes up to 1000.
+        method (str): one of :data:`METHODS`.
+        alpha (float): roughness of the material, > 0; Toksvig's formula ends at 1.
+        distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
+        max_anisotropy (float): ≥ 1, see :class:`~.MomentPyramid`.
+        owner (str): whom errors name, usually the plugin.
+        reach (Reach): what will be asked; None for anything. MIP levels that no such footprint
+            needs are then left out. Lobes within the reach are the same to the last bit.
+
+    Attributes:
+        data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
+            change of its values, :meth:`parameters_changed` rebuilds the MIP chain.
+        alpha (mi.Float): the roughness.
+
+    Raises :class:`~.ParameterError`.
+    """
+
+    # What the reference is to do alike: a Gaussian footprint, no clamped triangles.
+    kernel, epsilon = "gaussian", 0.0
+
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        method: str = "lean",
+        alpha: float = 0.05,
+        distribution: str = "beckmann",
+        max_anisotropy: float = 16.0,
+        owner: str = "Filtered",
+        reach: Reach | None = None,
+    ) -> None:
+        check_choice(owner, "method", method, tuple(METHODS))
+        check_choice(owner, "distribution", distribution, DISTRIBUTIONS)
+        self.method = METHODS[method]
+        check(
+            distribution in self.method.distributions,
+            owner,
+            "distribution",
+            f"{' or '.join(self.method.distributions)}, for which alone {method} is defined",
+            distribution,
+        )
+        check(max_anisotropy >= 1, owner, "max_anisotropy", "a number ≥ 1", max_anisotropy)
+        self.name, self.distribution, self.owner = method, distribution, owner
+        self.max_anisotropy, self.wrap_mode = float(max_anisotropy), normal_map.wrap_mode
+        self.reach = reach
+        self.alpha = mi.Float(alpha)
+        self.check_alpha()
+        self.data = mi.TensorXf(normal_map.normals)
+        self.build(normal_map)
+
+    def build(self, normal_map: NormalMap) -> None:
+        """Check the slopes, and make the MIP chain of ``self.data``."""
+        self.normal_map = normal_map
+        z_squared = 1 - (normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
+        check_texels(
+            self.owner,
+            "data",
+            f"a map with slopes up to {MAX_SLOPE}",
+            {"steeper": z_squared * (1 + MAX_SLOPE**2) < 1},
+        )
+        self.pyramid = MomentPyramid(
+            self.data,
+            self.wrap_mode,
+            self.method.moments,
+            max_anisotropy=self.max_anisotropy,
+            reach=self.reach,
+            spread=self.method.spread,
+            between=self.method.between,
+        )
+
+    def check_alpha(self) -> None:
+        """Raise unless the roughness is in the method's range."""
+        limit = 1 if self.name == "toksvig" else inf
+        check(
+            dr.all(dr.isfinite(self.alpha) & (self.alpha > 0) & (self.alpha <= limit)),
+            self.owner,
+            "alpha",
+            "a finite number > 0" + (" and ≤ 1" if limit == 1 else ""),
+            self.alpha[0],
+        )
+
+    def lobe(self, footprint: Footprint) -> SlopeLobe:
+        """The lobe of a footprint, given in the UV space of the map."""
+        if isinstance(footprint, LobeFootprint):
+            return footprint.lobe
+        averages = self.pyramid.average(footprint)
+        return self.method.lobe(averages, dr.square(self.alpha), self.distribution)
+
+    def with_lobe(self, footprint: Footprint) -> LobeFootprint:
+        """The footprint, with its lobe."""
+        return LobeFootprint(footprint, self.lobe(footprint))
+
+    def eval(self, m: mi.Vector2f, footprint: Footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk; 0 outside of it."""
+        return dr.select(active, self.lobe(footprint).eval(m), 0)
+
+    def sample(
+        self,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: bool | mi.Bool = True,
+    ) -> mi.Vector2f:
+        """Draw a projected normal with density D: the normals visible from straight above."""
+        return self.lobe(footprint).sample_visible(mi.Vector3f(0, 0, 1), sample1, sample2).xy
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("data", self.data, mi.ParamFlags.Differentiable)
+        callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check what has changed, and rebuild. Derivatives keep flowing."""
+        self.check_alpha()
+        if not keys or "data" in keys:
+            self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the MIP chain, bytes."""
+        return self.pyramid.nbytes
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of the structure, bytes."""
+        return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.nbytes}
+
+    def __repr__(self) -> str:
+        height, width, _ = self.data.shape
+        return (
+            f"Filtered[{self.name}, {self.distribution}, alpha={self.alpha[0]:g}, "
+            f"{width}×{height} texels, {self.wrap_mode}, {self.nbytes / 2**20:.1f} MiB]"
+        )
+
+
+# ------------------------------------------------------------------------------------------------
+#  In the microfacet frame
+# ------------------------------------------------------------------------------------------------
+
+
+class VisibleNormals:
+    """Draws from a lobe's normals those that the viewer sees; see ``microfacet.PndfNormals``.
+
+    Args:
+        pndf (Filtered): whose lobe.
+    """
+
+    def __init__(self, pndf: Filtered) -> None:
+        self.pndf = pndf
+
+    def sample(
+        self,
+        wi: mi.Vector3f,
+        footprint: Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool,
+    ) -> mi.Vector3f:
+        """A unit normal for the view from ``wi``."""
+        return self.pndf.lobe(footprint).sample_visible(wi, sample1, sample2)
+
+    def pdf(
+        self,
+        wi: mi.Vector3f,
+        m: mi.Vector3f,
+        density: mi.Float,
+        footprint: Footprint,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """Density of ``m`` per solid angle, given ``density``, which is D(m)."""
+        return self.pndf.lobe(footprint).visible_pdf(wi, m, density)
+
+
+class LobeMasking(SmithMasking):
+    """Smith's masking and shadowing by the facets of a lobe about its mean facet.
+
+    ``Λ = P/A − 1`` with A the area of the mean facet seen, P that of all facets that face the
+    direction (``slope_lobe.py``); 0 where the mean facet faces away. With ``projection`` the
+    reflection is that of the mean facet, not of the geometric surface: ``cosθ_i`` in the
+    denominator of the BRDF becomes A (Dupuy et al. 2013). No more light is reflected
+    then than arrives, whatever the mean slope.
+
+    Args:
+        pndf (Filtered): whose lobe.
+        height_correlated: see :class:`SmithMasking`.
+        projection (bool): LEADR's.
+    """
+
+    def __init__(
+        self, pndf: Filtered, height_correlated: bool = True, projection: bool = False
+    ) -> None:
+        super().__init__(height_correlated)
+        self.pndf, self.projection = pndf, projection
+
+    def smith_lambda(self, w: mi.Vector3f, footprint: Footprint, active: mi.Bool) -> mi.Float:
+        lobe = self.pndf.lobe(footprint)
+        mean = lobe.mean_cosine(w)
+        facing = mean > 0
+        ratio = lobe.visible_area(w) / dr.select(facing, mean, 1)
+        return dr.select(facing, dr.maximum(ratio - 1, 0), 0)
+
+    def eval(
+        self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint, active: mi.Bool
+    ) -> mi.Float:
+        lobe = self.pndf.lobe(footprint)
+        mean_i, mean_o = lobe.mean_cosine(wi), lobe.mean_cosine(wo)
+        facing = (mean_i > 0) & (mean_o > 0)
+        value = super().eval(wi, wo, footprint, active)
+        if self.projection:
+            value = value * wi.z / dr.select(facing, mean_i, 1)
+        return dr.select(facing, value, 0)
+
+    def __repr__(self) -> str:
+        return (
+            f"smith[height_correlated = {self.height_correlated}"
+            f"{', projection' if self.projection else ''}]"
+        )

@@ -1,0 +1,166 @@
+"""4D Gaussians in position × normal space, seen through a Gaussian footprint.
+
+Yan, Hašan, Marschner and Ramamoorthi, "Position-Normal Distributions for Efficient Rendering of
+Specular Microstructure" (2016), section 5.1 and appendix. A lobe stands at the position u_i with
+the positional covariance S; its normals are s_i + J δu, of covariance R (Eq. 13 has S = σ_h² I and
+R = σ_r² I). Under a footprint N(u_0, Σ_p), with d = u_0 − u_i and T = Σ_p + S,
+
+    N(u; u_0, Σ_p) N(u; u_i, S) = N(d; 0, T) N(u; u_i + μ, C)        μ = S T⁻¹ d,  C = Σ_p T⁻¹ S
+    ∫ N(u; u_0, Σ_p) lobe(u, s) du = N(d; 0, T) N(s; s_i + J μ, R + J C Jᵀ)
+
+The paper's appendix inverts 4×4 matrices with entries like 1/σ_r² and then subtracts: in float32
+nothing is left of stiff lobes. Here nothing large is inverted and nothing is subtracted. All
+covariances are sums of outer products v vᵀ, as the footprint itself is; their determinants and
+quadratic forms are then sums of squares (Cauchy and Binet: |Σ v vᵀ| = Σ_{k<l} (v_k × v_l)²).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import log, pi, sqrt
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.footprint.kernels import difference_of_products
+
+#: Standard deviation of a seed, in steps of its lattice: neighbours meet at half their height
+#: (Yan et al. 2016, section 4.1).
+SIGMA_H = 1 / sqrt(8 * log(2))
+
+
+def cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
+    """z component of the cross product of two vectors of the plane, without cancellation."""
+    return difference_of_products(a.x, b.y, a.y, b.x)
+
+
+class Gaussian:
+    """A Gaussian of the plane with mean 0 and covariance ``variance`` I + Σ v vᵀ.
+
+    Args:
+        vectors: any number of ``mi.Vector2f``.
+        variance (float or mi.Float): ≥ 0.
+
+    Attributes:
+        xx, xy, yy, determinant (mi.Float): the covariance; the determinant must be > 0 wherever
+            the Gaussian is evaluated.
+        peak (mi.Float): the density's value at 0.
+    """
+
+    def __init__(self, vectors: tuple = (), variance: float | mi.Float = 0.0) -> None:
+        self.vectors, self.variance = tuple(vectors), variance
+        xx = yy = mi.Float(variance)
+        xy, determinant = mi.Float(0), dr.square(mi.Float(variance))
+        for v in self.vectors:
+            xx, xy, yy = dr.fma(v.x, v.x, xx), dr.fma(v.x, v.y, xy), dr.fma(v.y, v.y, yy)
+            determinant = dr.fma(variance, dr.squared_norm(v), determinant)
+        for v, w in combinations(self.vectors, 2):
+            determinant = determinant + dr.square(cross(v, w))
+        self.xx, self.xy, self.yy, self.determinant = xx, xy, yy, determinant
+        self.inverse_root = dr.rsqrt(determinant)
+        self.peak = self.inverse_root * (1 / (2 * pi))
+
+    def distance_squared(self, d: mi.Vector2f) -> mi.Float:
+        """The squared Mahalanobis distance of ``d``."""
+        form = self.variance * dr.squared_norm(d)
+        for v in self.vectors:
+            form = form + dr.square(cross(v, d))
+        return form * dr.square(self.inverse_root)
+
+    def eval(self, d: mi.Vector2f) -> mi.Float:
+        """The density at ``d``."""
+        return self.peak * dr.exp(-0.5 * self.distance_squared(d))
+
+    def root(self) -> tuple[mi.Vector2f, mi.Vector2f]:
+        """Two vectors with the same covariance, (a, b) and (0, c); zero for a covariance of 0."""
+        extended = self.xx > 0
+        inverse = dr.select(extended, dr.rsqrt(dr.select(extended, self.xx, 1)), 0)
+        # Where xx vanishes so does xy, and the determinant says nothing of yy.
+        c = dr.select(extended, dr.sqrt(self.determinant) * inverse, dr.sqrt(self.yy))
+        return mi.Vector2f(self.xx * inverse, self.xy * inverse), mi.Vector2f(0, c)
+
+    def sample(self, normal: mi.Vector2f) -> mi.Vector2f:
+        """A vector with this density, from two standard normal numbers."""
+        first, second = self.root()
+        return first * normal.x + second * normal.y
+
+
+class Overlap:
+    """What a footprint sees of a lobe.
+
+    Costs of one query per lobe: with all lobes alike (S the same), make it once per footprint.
+
+    Args:
+        footprint (Gaussian): Σ_p; zero is legal.
+        lobe (Gaussian): S, in the same units.
+
+    Attributes:
+        total (Gaussian): N(·; 0, T), whose value at d is the lobe's mass under the footprint.
+        gain (mi.Matrix2f): S T⁻¹, which takes d to the mean offset μ from the lobe's centre.
+        root: two ``mi.Vector2f`` c with Σ c cᵀ = C, the covariance about that mean.
+    """
+
+    def __init__(self, footprint: Gaussian, lobe: Gaussian) -> None:
+        self.total = Gaussian(footprint.vectors + lobe.vectors, footprint.variance + lobe.variance)
+        scale = dr.rcp(self.total.determinant)
+
+        # S T⁻¹ = S adj(Σ_p + S) / |T| = (S adj(Σ_p) + |S| I) / |T|; adj(v vᵀ) = v⊥ v⊥ᵀ
+        xx = yy = lobe.determinant + lobe.variance * footprint.variance
+        xy = yx = mi.Float(0)
+        for v in footprint.vectors:
+            across = mi.Vector2f(-v.y, v.x)
+            # S v⊥, v⊥·s being v × s
+            image = lobe.variance * across
+            for s in lobe.vectors:
+                image = image + cross(v, s) * s
+            xx, xy = dr.fma(image.x, across.x, xx), dr.fma(image.x, across.y, xy)
+            yx, yy = dr.fma(image.y, across.x, yx), dr.fma(image.y, across.y, yy)
+        for s in lobe.vectors:
+            image = footprint.variance * s
+            xx, xy = dr.fma(s.x, image.x, xx), dr.fma(s.x, image.y, xy)
+            yx, yy = dr.fma(s.y, image.x, yx), dr.fma(s.y, image.y, yy)
+        self.gain = mi.Matrix2f(xx * scale, xy * scale, yx * scale, yy * scale)
+
+        # Σ_p T⁻¹ S = (|Σ_p| S + |S| Σ_p) / |T|, hence |C| = |Σ_p| |S| / |T|
+        a, b = footprint.determinant * scale, lobe.determinant * scale
+        offset = Gaussian()
+        offset.xx = dr.fma(a, lobe.xx, b * footprint.xx)
+        offset.xy = dr.fma(a, lobe.xy, b * footprint.xy)
+        offset.yy = dr.fma(a, lobe.yy, b * footprint.yy)
+        offset.determinant = a * lobe.determinant
+        self.root = offset.root()
+
+    def mass(self, d: mi.Vector2f) -> mi.Float:
+        """N(d; 0, T): mass of the lobe under the footprint, ``d`` = u_0 − u_i."""
+        return self.total.eval(d)
+
+    def mean(self, d: mi.Vector2f) -> mi.Vector2f:
+        """μ: mean offset from u_i under the footprint."""
+        return self.gain @ d
+
+    def normals(self, jacobian: mi.Matrix2f, roughness: Gaussian) -> Gaussian:
+        """N(·; 0, R + J C Jᵀ): distribution of the lobe's normals about s_i + J μ.
+
+        ``jacobian`` is ∂n/∂u in the units of the positions, ``roughness`` stands for R.
+        """
+        return Gaussian(
+            tuple(jacobian @ c for c in self.root) + roughness.vectors, roughness.variance
+        )
+
+
+def lattice_mass(x: mi.Vector2f, xx: mi.Float, xy: mi.Float, yy: mi.Float) -> mi.Float:
+    """W: the sum of N(x − k; 0, T) over all integer vectors k, by Poisson's formula.
+
+    The first four frequencies are enough, to 3e-6, for every T = Σ_p + ``SIGMA_H``² I.
+    """
+    mass = mi.Float(1)
+    # kᵀ T k and k·x for k = (1, 0), (0, 1), (1, 1), (1, −1)
+    for form, phase in (
+        (xx, x.x),
+        (yy, x.y),
+        (xx + 2 * xy + yy, x.x + x.y),
+        (xx - 2 * xy + yy, x.x - x.y),
+    ):
+        phase = 2 * pi * (phase - dr.round(phase))
+        mass = mass + 2 * dr.exp(-2 * pi**2 * form) * dr.cos(phase)
+    return mass

@@ -1,0 +1,1 @@
+"""Procedural microdetails on multiscale grids (Zirr and Kaplanyan 2016)."""

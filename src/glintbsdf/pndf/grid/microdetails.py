@@ -1,0 +1,541 @@
+"""Procedural microdetails on a hierarchy of grids.
+
+Zirr and Kaplanyan, "Real-time Rendering of Procedural Multiscale Materials" (I3D 2016). The surface
+is covered by grids whose cells grow by powers of two, and every cell holds a random, repeatable
+number of microdetails that reflect for the half vector asked for. There is no map, no structure and
+no memory: all comes from hashed integers. The functions stand in the paper's order and use its
+symbols; where they depart from it, they say so.
+
+Slopes are ``x = m_xy / m_z`` of a unit normal m; α = √2 σ is a Beckmann roughness. Subscripts: g
+the whole surface (global), l one microdetail (local), m the microdetails' centres (mesoscale).
+"""
+
+from __future__ import annotations
+
+from math import isfinite, log, pi, sqrt
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.core.errors import check
+from glintbsdf.core.hashing import coherent_vertex, gaussian, pcg3d, uniform
+from glintbsdf.footprint.gaussian import is_literal_zero
+from glintbsdf.footprint.lattice import floor_int
+
+#: Cells of the coarsest grid are 2⁴⁰ times as wide as those of the finest. They hold 2⁸⁰
+#: microdetails, whose noise is below the last bit of a float: larger footprints need none larger.
+MAX_LEVEL = 40
+
+#: The smallest pixel, relative to the largest UV coordinate: four spacings of float32 there.
+UV_RESOLUTION = 2.0**-22
+
+#: Half the shortest median that is walked, in cells. It keeps the weights free of 0/0.
+MIN_HALF_MEDIAN = 1e-3
+
+#: What the median loses at each end, in smaller extents of the pixel: the paper's half a cell, and
+#: a little more, so that pixels which are round but for the perspective need no third column.
+SHORTENED = 0.55
+
+#: The smallest roughness that Mitsuba's Beckmann distribution, which is sampled, can have.
+MIN_ALPHA = 1e-4
+
+#: Expected counts up to this are drawn from the exact binomial distribution, so many terms of it.
+EXACT_MEAN, EXACT_TERMS = 4.0, 10
+
+# ------------------------------------------------------------------------------------------------
+#  Section 3: the biscale Beckmann distribution
+# ------------------------------------------------------------------------------------------------
+
+
+def beckmann(x: mi.Vector2f, alpha: mi.Vector2f) -> mi.Float:
+    """Beckmann's density of slopes: a Gaussian with σ = α/√2 along each axis."""
+    return dr.exp(-dr.squared_norm(x / alpha)) / (pi * alpha.x * alpha.y)
+
+
+def slope_jacobian(cos_theta: mi.Float) -> mi.Float:
+    """From a density of slopes to one of projected normals: |dx/ds| = 1/cos⁴θ (before Eq. 6)."""
+    return dr.rcp(dr.square(dr.square(cos_theta)))
+
+
+def mesoscale_roughness(alpha_g: mi.Vector2f, alpha_l: mi.Vector2f) -> mi.Vector2f:
+    """α_m = √(α_g² − α_l²) of Eq. 4; 0 along the axis of grooves, where α_l = α_g (Eq. 6)."""
+    return dr.safe_sqrt((alpha_g - alpha_l) * (alpha_g + alpha_l))
+
+
+# ------------------------------------------------------------------------------------------------
+#  Sections 4.2 and 4.4: the cells that a pixel covers
+# ------------------------------------------------------------------------------------------------
+
+
+class CoveredCells:
+    """The vertices of two grids that a footprint covers, and their weights (Fig. 3 and 6).
+
+    What the paper calls a cell is here the surrounding of a vertex of the grid, which weighs by a
+    bilinear tent: then a cell and the one of the next coarser grid with the same name have the same
+    centre. The pixel is a rectangle on the principal axes of the footprint, one standard deviation
+    to either side. Its smaller extent selects the grids; the median of the larger one is walked
+    column by column (row by row, where it is steeper than 45°). A column weighs as much of the
+    median, shortened at both ends by ``SHORTENED`` of the smaller extent, as its tent sees; within
+    a column the tents of the two nearest vertices weigh. All weights sum to one and change
+    continuously.
+
+    Args:
+        footprint (Footprint): the footprint.
+        scale (mi.Float): cells of the finest grid per unit of UV.
+        stretch (mi.Vector2f): factors ≤ 1 on the coordinates, after grids have been selected.
+        max_anisotropy (mi.Float): K_a, the largest ratio of the extents; beyond, cells grow.
+
+    Attributes:
+        level (mi.Int): the finer of the two grids: its cells are 2^level times the finest.
+        blend (mi.Float): weight of the coarser one, in [0, 1).
+    """
+
+    def __init__(self, footprint, scale, stretch, max_anisotropy) -> None:
+        limit = 2.0**MAX_LEVEL
+        du, dv = (dr.clip(axis * scale, -limit, limit) for axis in (footprint.du, footprint.dv))
+        a, b, c = covariance(du, dv)
+        major = dr.sqrt(larger_eigenvalue(a, b, c))
+        minor = dr.abs(du.x * dv.y - du.y * dv.x) / dr.select(major > 0, major, 1)
+
+        # s_c, in cells of the finest grid; no finer one is needed, as a cell of it is one detail
+        size = dr.maximum(2 * minor, 2 * major / max_anisotropy)
+        size = dr.maximum(size, UV_RESOLUTION * dr.max(dr.abs(footprint.uv)) * scale)
+        size = dr.clip(size, 1, limit)
+        self.level = mi.Int(dr.reinterpret_array(mi.UInt32, size) >> 23) - 127  # floor(log2)
+        self.blend = dr.log2(size * power_of_two(-self.level))
+
+        # The median, in stretched coordinates: p along it and q across, q = slope · p
+        a, b, c = covariance(du * stretch, dv * stretch)
+        squared_major = larger_eigenvalue(a, b, c)
+        self.along_x = a >= c
+        rise = squared_major - dr.minimum(a, c)
+        self.slope = dr.select(rise > 0, b / dr.select(rise > 0, rise, 1), 0)
+        half = dr.maximum(dr.sqrt(squared_major) - SHORTENED * size, 0)
+        self.half = half * dr.rsqrt(1 + dr.square(self.slope))
+        self.centre = self.swapped(footprint.uv * scale * stretch)
+
+        # With one coordinate stretched to nothing, all vertices lie on a line
+        self.rows = 1 if any(is_literal_zero(s) for s in stretch) else 2
+
+    def swapped(self, v):
+        """(p, q) from (x, y), and back."""
+        return type(v)(dr.select(self.along_x, v.x, v.y), dr.select(self.along_x, v.y, v.x))
+
+    def grid(self, level, weight):
+        """What a walk over one grid needs, in its cells, relative to the vertex before the centre.
+
+        Returns its level and weight, that vertex (p, q), the centre relative to it, half the
+        median along p, the first column and the number of columns.
+        """
+        spacing = power_of_two(-level)
+        centre = self.centre * spacing
+        origin = dr.floor(centre)
+        centre = centre - origin
+        half = dr.maximum(self.half * spacing, MIN_HALF_MEDIAN)
+        first = floor_int(centre.x - half)
+        return (
+            level,
+            weight,
+            mi.Int(origin.x),
+            mi.Int(origin.y),
+            centre.x,
+            centre.y,
+            half,
+            first,
+            floor_int(centre.x + half) + 2 - first,
+        )
+
+    def sum(self, term, zero, active):
+        """Σ weight · term(x, y, level, active) over all vertices (x, y) of both grids.
+
+        ``zero`` is the empty sum; ``term`` must return the same type.
+        """
+        grids = self.grid(self.level, 1 - self.blend), self.grid(self.level + 1, self.blend)
+        finer_columns, coarser_columns = (grid[-1] for grid in grids)
+
+        def column(step, total):
+            finer = step < finer_columns
+            level, weight, p0, q0, p, q, half, first, _ = (
+                dr.select(finer, *pair) for pair in zip(*grids, strict=True)
+            )
+            i = first + dr.select(finer, step, step - finer_columns)
+            x = mi.Float(i)
+            weight = weight * (tent_integral(p + half - x) - tent_integral(p - half - x))
+            weight = weight / (2 * half)
+            y = q + self.slope * (dr.clip(x, p - half, p + half) - p)
+            row = dr.floor(y)
+            fraction = y - row
+            row = q0 + mi.Int(row)
+            weights = (weight * (1 - fraction), weight * fraction) if self.rows == 2 else (weight,)
+            for j, share in enumerate(weights):
+                vertex = self.swapped(mi.Vector2i(p0 + i, row + j))
+                total = total + share * term(vertex.x, vertex.y, level, active & (share > 0))
+            return step + 1, total
+
+        end = finer_columns + coarser_columns
+        _, total = dr.while_loop(
+            (mi.Int(0), zero), lambda step, total: active & (step < end), column, label="cells"
+        )
+        return total
+
+
+def covariance(du: mi.Vector2f, dv: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """The entries xx, xy, yy of du duᵀ + dv dvᵀ."""
+    return (
+        dr.fma(du.x, du.x, dv.x * dv.x),
+        dr.fma(du.x, du.y, dv.x * dv.y),
+        dr.fma(du.y, du.y, dv.y * dv.y),
+    )
+
+
+def larger_eigenvalue(a: mi.Float, b: mi.Float, c: mi.Float) -> mi.Float:
+    """Of the symmetric matrix ((a, b), (b, c))."""
+    difference = 0.5 * (a - c)
+    return 0.5 * (a + c) + dr.sqrt(dr.fma(difference, difference, b * b))
+
+
+def power_of_two(exponent: mi.Int) -> mi.Float:
+    """2^exponent, exactly; the exponent in [−126, 127]."""
+    return dr.reinterpret_array(mi.Float, mi.UInt32(exponent + 127) << 23)
+
+
+def tent_integral(x: mi.Float) -> mi.Float:
+    """∫ max(1 − |t|, 0) dt from −∞ to x, less a half; odd in x."""
+    x = dr.clip(x, -1, 1)
+    return x * (1 - 0.5 * dr.abs(x))
+
+
+# ------------------------------------------------------------------------------------------------
+#  Section 4.3: the number of reflecting microdetails
+# ------------------------------------------------------------------------------------------------
+
+
+def paraboloid_map(x: mi.Vector2f, cos_theta: mi.Float) -> mi.Vector2f:
+    """The half vector with slopes ``x`` on the plane: tan(θ/2) towards its azimuth."""
+    return x * (cos_theta / (1 + cos_theta))
+
+
+class ReflectingCount:
+    """Draws the number of microdetails out of n that reflect, each with probability P(h).
+
+    Counts from the less likely of both outcomes, so that P → 1 is as good as P → 0. Small
+    expectations are drawn from the exact binomial distribution by inversion, its tail after
+    ``EXACT_TERMS`` from a truncated geometric distribution that goes on with the ratio of the next
+    two terms; all others from a Gaussian with the binomial's mean and variance, plus the quadratic
+    term of Cornish and Fisher that gives it the binomial's skewness as well: so the Gaussian may
+    begin at ``EXACT_MEAN``, where a symmetric one would often be negative. The mean is n P within
+    8e-4 (both errors are largest there).
+
+    Args:
+        p (mi.Float): P(h), in [0, 1].
+    """
+
+    def __init__(self, p: mi.Float) -> None:
+        self.inverted = p > 0.5
+        self.p = dr.select(self.inverted, 1 - p, p)
+        self.odds = self.p / (1 - self.p)
+        # log(1 − p); float32 rounds 1 − p where p is small
+        series = -self.p * (1 + self.p * (0.5 + self.p * (1 / 3)))
+        self.log_none = dr.select(self.p < 0.02, series, dr.log(1 - self.p))
+
+    def draw(self, bits: mi.UInt32, n: mi.Float, active: mi.Bool) -> mi.Float:
+        """The count for random ``bits``; ``n`` is a whole number up to 1e30."""
+        u, mean = uniform(bits), n * self.p
+        few = mean <= EXACT_MEAN
+        # P(N = 0) ≥ 1 − n P: most cells hold nothing that reflects, and this saves their search
+        some = active & few & (u >= 1 - mean)
+        (count,) = dr.if_stmt(
+            (mi.Float(0),),
+            active & ~few,
+            lambda count: (self.approximate(gaussian(bits), n),),
+            lambda count: (count,),
+            label="many",
+        )
+        (count,) = dr.if_stmt(
+            (count,),
+            some,
+            lambda count: (self.exact(u, n, some),),
+            lambda count: (count,),
+            label="few",
+        )
+        return dr.select(self.inverted, n - count, count)
+
+    def exact(self, u: mi.Float, n: mi.Float, active: mi.Bool) -> mi.Float:
+        """By inversion: the number of values of the distribution function that are ≤ u."""
+
+        def more(count, probability, below):
+            # From P(N = k) and P(N ≤ k) to those of k + 1
+            probability = probability * dr.maximum(n - count, 0) * self.odds / (count + 1)
+            return count + 1, probability, below + probability
+
+        none = dr.exp(n * self.log_none)
+        count, probability, below = dr.while_loop(
+            (mi.Float(0), none, none + 0),
+            lambda count, probability, below: active & (u >= below) & (count < EXACT_TERMS),
+            more,
+            label="binomial",
+        )
+        ratio = dr.maximum(n - EXACT_TERMS, 0) * (self.odds / (EXACT_TERMS + 1))
+
+        def tail(count):
+            # From here on P(N ≥ k) falls by the same ratio with every k, up to N = n
+            log_ratio = dr.log(ratio)
+            left = (1 - u) / (1 - (below - probability))
+            last = dr.exp(log_ratio * (n - EXACT_TERMS + 1))
+            return (count + dr.floor(dr.log(dr.fma(left, 1 - last, last)) / log_ratio),)
+
+        return dr.if_stmt(
+            (count,),
+            active & (count == EXACT_TERMS) & (ratio > 0),
+            tail,
+            lambda count: (count,),
+            label="tail",
+        )[0]
+
+    def approximate(self, x: mi.Float, n: mi.Float) -> mi.Float:
+        """The Gaussian number ``x`` moved, scaled, and bent to the skewness (1 − 2P)/σ."""
+        mean = n * self.p
+        count = mean + dr.sqrt(mean * (1 - self.p)) * x
+        count = count + (1 - 2 * self.p) / 6 * (x * x - 1)
+        return dr.clip(count, 0, n)
+
+
+# ------------------------------------------------------------------------------------------------
+#  Section 4.5: colours
+# ------------------------------------------------------------------------------------------------
+
+
+class Wheel:
+    """Fully saturated colours of all hues, twice as bright as displayable: their mean is white."""
+
+    mean = (1.0, 1.0, 1.0)
+
+    def pick(self, u: mi.Float) -> mi.Color3f:
+        """The colour at the fraction ``u`` of the way around the wheel."""
+        hue = [6 * dr.abs(u - dr.floor(u + 0.5 - k / 3) - k / 3) for k in range(3)]
+        return mi.Color3f([2 * dr.clip(2 - h, 0, 1) for h in hue])
+
+    def __repr__(self) -> str:
+        return "wheel"
+
+
+class Palette:
+    """The colours of an image, each as likely as any other.
+
+    Args:
+        colors: linear RGB values, an array N×3 (NumPy, float32).
+    """
+
+    def __init__(self, colors) -> None:
+        self.count = len(colors)
+        self.mean = tuple(float(x) for x in colors.mean(0))
+        self.colors = mi.Float(colors.ravel())
+
+    def pick(self, u: mi.Float) -> mi.Color3f:
+        """The colour at the fraction ``u`` of the way through the image."""
+        return dr.gather(mi.Color3f, self.colors, mi.UInt32(u * self.count))
+
+    def __repr__(self) -> str:
+        return f"palette of {self.count}"
+
+
+# ------------------------------------------------------------------------------------------------
+#  Listing 1
+# ------------------------------------------------------------------------------------------------
+
+
+def check_ranges(values: dict[str, float], owner: str) -> None:
+    """Raise ``ParameterError`` unless all numeric parameters of :class:`Grid` are in range."""
+
+    def require(name: str, requirement: str, allowed: bool) -> None:
+        check(isfinite(values[name]) and allowed, owner, name, requirement, values[name])
+
+    for axis in "uv":
+        alpha, detail = values[f"alpha_{axis}"], values[f"detail_alpha_{axis}"]
+        # With some room for rounding to float32
+        require(f"alpha_{axis}", f"a finite number ≥ {MIN_ALPHA:g}", alpha >= 0.999 * MIN_ALPHA)
+        require(
+            f"detail_alpha_{axis}",
+            f'greater than 0 and at most "alpha_{axis}" = {alpha:g}',
+            0 < detail <= alpha,
+        )
+    require("density", "log10 of a density, in [-20, 20]", abs(values["density"]) <= 20)
+    require("size_variation", "a finite number ≥ 0", values["size_variation"] >= 0)
+    require("intensity", "a finite number ≥ 0", values["intensity"] >= 0)
+    require("light_spread", "an angle in [0, π/2)", 0 <= values["light_spread"] < pi / 2)
+    require("max_anisotropy", "a finite number ≥ 1", values["max_anisotropy"] >= 1)
+
+
+class Grid:
+    """P-NDF of procedural microdetails (Listing 1).
+
+    Its mean over places is exactly the Beckmann distribution of the roughness α_g. A single place
+    is not normalised: more microdetails than their share reflecting in one direction are not made
+    up for by fewer in others. It cannot be sampled; draw from the mean instead.
+
+    D(m) is the product of the Beckmann density and of a random factor of mean one, the number of
+    reflecting microdetails over its expectation. Derivatives flow through the first: glints stay
+    where and as many as they are, and the derivative of the mean is exact.
+
+    Belongs to the variant of Mitsuba that is active when it is made.
+
+    Args:
+        alpha (pair of floats): α_g along u and v, ≥ 1e-4.
+        detail_alpha (pair of floats): α_l, in (0, α_g] per axis; α_l = α_g along one axis makes
+            grooves along it.
+        density (float): log10 of the microdetails per unit of UV area, in [−20, 20].
+        size_variation (float): standard deviation, ≥ 0, of the number of microdetails in a cell,
+            relative to its mean.
+        intensity (float): factor on the result, ≥ 0.
+        light_spread (float): half angle of the light's cone, radians, in [0, π/2): half vectors
+            that lie within half of it of each other see the same microdetails.
+        colors (Wheel, Palette or None): colours of the microdetails.
+        max_anisotropy (float): K_a ≥ 1, the largest aspect ratio of a pixel that is resolved.
+        seed (int): another one gives other microdetails, in [0, 2³²).
+        owner (str): whom errors name, usually the plugin.
+
+    Raises :class:`~.ParameterError`.
+    """
+
+    #: Nothing is stored.
+    nbytes = 0
+
+    #: How the cells of a footprint are chosen; benchmarks put other ways in its place.
+    covered_cells = CoveredCells
+
+    NAMES = (
+        "alpha_u",
+        "alpha_v",
+        "detail_alpha_u",
+        "detail_alpha_v",
+        "density",
+        "size_variation",
+        "intensity",
+        "light_spread",
+        "max_anisotropy",
+    )
+
+    def __init__(
+        self,
+        alpha=(0.3, 0.3),
+        detail_alpha=(0.05, 0.05),
+        density=8.0,
+        size_variation=0.3,
+        intensity=1.0,
+        light_spread=0.0,
+        colors=None,
+        max_anisotropy=16.0,
+        seed=0,
+        owner="Grid",
+    ) -> None:
+        values = (
+            *alpha,
+            *detail_alpha,
+            density,
+            size_variation,
+            intensity,
+            light_spread,
+            max_anisotropy,
+        )
+        values = dict(zip(self.NAMES, values, strict=True))
+        check_ranges(values, owner)
+        check(
+            isinstance(seed, int) and not isinstance(seed, bool) and 0 <= seed < 2**32,
+            owner,
+            "seed",
+            "a whole number in [0, 2³²)",
+            seed,
+        )
+        for name, value in values.items():
+            setattr(self, name, mi.Float(value))
+        self.colors, self.owner = colors, owner
+        self.seed = pcg3d(mi.UInt32(seed), 0, 0)[0]
+        self.derive()
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check parameters that have changed, and derive what depends on them."""
+        if not keys or set(keys) & set(self.NAMES):
+            check_ranges({name: getattr(self, name)[0] for name in self.NAMES}, self.owner)
+            self.derive()
+
+    def derive(self) -> None:
+        """Everything that depends on the parameters alone."""
+        self.alpha = mi.Vector2f(self.alpha_u, self.alpha_v)
+        with dr.suspend_grad():
+            alpha_g = mi.Vector2f(self.alpha)
+            alpha_l = mi.Vector2f(self.detail_alpha_u, self.detail_alpha_v)
+            alpha_m = mesoscale_roughness(alpha_g, alpha_l)
+            # To a wide light a microdetail looks rougher, if not rougher than the surface
+            apparent = dr.minimum(alpha_l + dr.tan(0.5 * self.light_spread), alpha_g)
+            self.largest_p = apparent.x * apparent.y / (alpha_g.x * alpha_g.y)
+            # Cells of half vectors are as large as the lobe of a microdetail, √π α_l, which is half
+            # as much on the paraboloid map: so a microdetail reflects in about one of them. Along
+            # grooves all microdetails have one lobe in common, and there is one cell.
+            self.cells_per_unit = 2 * alpha_m / (sqrt(pi) * apparent * alpha_g)
+            # γ_m of section 4.4: one coordinate shrinks, so that details are long where α_m is low
+            larger = dr.max(alpha_m)
+            self.stretch = dr.select(larger > 0, alpha_m / dr.select(larger > 0, larger, 1), 1)
+            # The finest grid has one microdetail per cell
+            self.scale = dr.exp(self.density * (0.5 * log(10)))
+
+    def eval(
+        self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True
+    ) -> mi.Float | mi.Color3f:
+        """D(m) over the disk of projected normals, in colour where there are ``colors``.
+
+        ``footprint``: a :class:`~.Footprint`.
+        """
+        squared_z = 1 - dr.squared_norm(m)
+        active = mi.Bool(active) & (squared_z > 1e-8)
+        cos_theta = dr.sqrt(dr.select(active, squared_z, 1))
+        x = dr.select(active, m, 0) / cos_theta
+        density = self.intensity * beckmann(x, self.alpha) * slope_jacobian(cos_theta)
+        with dr.suspend_grad():
+            # P(h) = D_g(h) / D_l(0) (Eq. 7)
+            p = self.largest_p * dr.exp(-dr.squared_norm(x / self.alpha))
+            active &= p > dr.smallest(mi.Float)
+            hp = paraboloid_map(x, cos_theta) * self.cells_per_unit
+            noise = self.reflecting(hp, p, footprint, active) / dr.select(active, p, 1)
+        return dr.select(active, density * noise, 0)
+
+    def reflecting(
+        self, hp: mi.Vector2f, p: mi.Float, footprint, active: mi.Bool
+    ) -> mi.Float | mi.Color3f:
+        """The fraction of microdetails under the footprint that reflect (Listing 1, lines 7 to 24).
+
+        ``hp``: half vector on the paraboloid map, in cells; ``p``: P(h).
+        """
+        cells = self.covered_cells(footprint, self.scale, self.stretch, self.max_anisotropy)
+        binomial = ReflectingCount(p)
+
+        def fraction(x, y, level, active):
+            x, y, name = coherent_vertex(x, y, level)
+            a, b, c = pcg3d(x, y, name + self.seed)
+            # Line 12: quantise the half vector, from cell to cell at other places
+            hidx = mi.Vector2u(mi.Vector2i(dr.floor(hp + mi.Vector2f(uniform(a), uniform(b)))))
+            a, b, c = pcg3d(hidx.x, hidx.y, c)
+            # Lines 14 and 16: a whole number of microdetails, of which there is always one
+            n = power_of_two(2 * level)
+            if not is_literal_zero(self.size_variation):
+                n = dr.round(n * dr.abs(1 + self.size_variation * gaussian(a)))
+                n = dr.maximum(n, 1)
+            # Lines 18 and 20; D_l(0) cancels
+            count = binomial.draw(b, n, active)
+            if self.colors is None:
+                return count / n
+            # What N colours drawn at random add up to is near N times their mean
+            mean = mi.Color3f(*self.colors.mean)
+            color = self.colors.pick(uniform(c)) - mean
+            return count / n * (mean + color * dr.rsqrt(dr.maximum(count, 1)))
+
+        return cells.sum(fraction, mi.Float(0) if self.colors is None else mi.Color3f(0), active)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        smooth, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.NonDifferentiable
+        for name in self.NAMES:
+            is_smooth = name in ("alpha_u", "alpha_v", "intensity")
+            callback.put(name, getattr(self, name), smooth if is_smooth else discontinuous)
+
+    def __repr__(self) -> str:
+        members = ", ".join(f"{name}={getattr(self, name)[0]:g}" for name in self.NAMES)
+        return f"Grid[{members}, colors={self.colors}]"

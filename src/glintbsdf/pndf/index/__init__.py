@@ -1,0 +1,1 @@
+"""Inverted lists: for every normal, the places that may show it."""

@@ -1,0 +1,585 @@
+"""Point location in the manifold, inverted: for every normal, the quads that can show it.
+
+The plane of projected normals is cut into cells, the lattice of texels into rows of blocks. For
+every (row of blocks, cell) there is a list of the quads of the row whose normals reach into the
+cell, from left to right, with the list's subdivision by blocks. A query has one cell; every row of
+blocks under its footprint is then one run of consecutive entries, whatever the footprint's shape:
+no tree, no stack, nothing visited that is not near in both position and normal.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from operator import or_
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.progress import progress
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
+
+SHIFT = BLOCK.bit_length() - 1  # quad to block
+
+#: Resolution per axis of the table that maps a normal to its cell.
+RESOLUTION = 1024
+
+#: Cells per axis that are tried, the finest that fits being taken.
+DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
+
+#: Memory allowed, bytes per quad, the vertices not counted.
+BYTES_PER_QUAD = 48
+
+#: Half width (in units of projected normals) by which bounds are widened against rounding.
+MARGIN = 1e-6
+
+#: Counters of one strip of the build: bounds what the build needs on top of its result.
+STRIP_COUNTERS = 1 << 23
+
+
+# ------------------------------------------------------------------------------------------------
+#  Queries
+# ------------------------------------------------------------------------------------------------
+
+
+def every_quad(lattice: Lattice, kernel, add, active, zero=None):
+    """Sum over all quads that the kernel's bounding box touches; see :meth:`QuadLists.visit`.
+
+    The right loop for footprints of a few texels, where searching costs more than it saves. The sum
+    begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
+    """
+    mean = mi.Vector2f(kernel.mean)
+    left, top = floor_int(mean.x - kernel.reach_u), floor_int(mean.y - kernel.reach_v)
+    right, bottom = floor_int(mean.x + kernel.reach_u), floor_int(mean.y + kernel.reach_v)
+    first_column, first_row = lattice.x.locate(left)[1], lattice.y.locate(top)[1]
+
+    def body(x, y, column, row, active, density):
+        density = add(density, row, column, mi.Vector2f(x, y) - mean, active)
+        new_row = x == right
+        row = dr.select(new_row, lattice.y.following(y, row), row)
+        column = dr.select(new_row, first_column, lattice.x.following(x, column))
+        x, y = dr.select(new_row, left, x + 1), dr.select(new_row, y + 1, y)
+        return x, y, column, row, active & (y <= bottom), density
+
+    state = (
+        mi.Int(left),
+        mi.Int(top),
+        mi.Int(first_column),
+        first_row,
+        mi.Bool(active),
+        mi.Float(0) if zero is None else zero,
+    )
+    return dr.while_loop(
+        state, lambda *state: state[4], body, max_iterations=-1, label="every quad"
+    )[5]
+
+
+def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=None) -> mi.Float:
+    """Sum over the entries of the lists that the kernel touches; see :meth:`QuadLists.visit`.
+
+    The lattice's blocks have the side ``1 << shift``, a number or one per lane (``mi.Int``).
+    ``run_of(row of blocks, first block, last block, active)`` returns begin and end of a run of
+    consecutive entries, ``place_of(entry, first row of the row of blocks, active)`` the row and
+    column that an entry stands for, and whatever else ``add`` is to be given. The sum begins with
+    ``zero``, as in :func:`every_quad`.
+
+    One loop over the runs, and one in it over a run's entries. In a flat one, which no lane leaves
+    before all are done, nearly every step is the first of a run to some of the lanes, so that all
+    wait while it is found; to wait at the end of the runs is cheaper by a third.
+    """
+    columns, rows = lattice.x, lattice.y
+    mean = mi.Vector2f(kernel.mean)
+    bottom = floor_int(mean.y + kernel.reach_v)
+
+    def body(x, right, next_y, origin_y, row, active, density):
+        # The next row of blocks where this one is done, and its extent under the kernel.
+        new_row = x > right
+        active = active & ~(new_row & (next_y > bottom))
+        origin, y, row_end = rows.locate(next_y)
+        first_row = (y >> shift) << shift
+        below = origin + dr.minimum(first_row + (1 << shift), row_end)
+        start, stop = kernel.row_extent(
+            mi.Float(origin + first_row) - mean.y, mi.Float(below) - mean.y
+        )
+        x, right, next_y, origin_y, row = (
+            dr.select(new_row, new, old)
+            for new, old in (
+                (floor_int(mean.x + start), x),
+                (floor_int(mean.x + stop), right),
+                (below, next_y),
+                (origin, origin_y),
+                (first_row, row),
+            )
+        )
+        # Its next run: as far as blocks are stored side by side.
+        origin_x, column, column_end = columns.locate(x)
+        last = dr.minimum(right - origin_x, column_end - 1) >> shift
+        entry, end = run_of(
+            mi.UInt32(row >> shift), mi.UInt32(column >> shift), mi.UInt32(last), active
+        )
+        x = origin_x + dr.minimum((last + 1) << shift, column_end)
+
+        def add_entry(entry, density):
+            found = active & (entry < end)
+            place = place_of(entry, row, found)
+            corner = mi.Vector2f(origin_x + place[1], origin_y + place[0]) - mean
+            return entry + 1, add(density, *place, corner, found)
+
+        _, density = dr.while_loop(
+            (entry, density),
+            lambda entry, _: active & (entry < end),
+            add_entry,
+            max_iterations=-1,
+            label="entries",
+        )
+        return x, right, next_y, origin_y, row, active, density
+
+    top = floor_int(mean.y - kernel.reach_v)
+    none = mi.Int(0)
+    zero = mi.Float(0) if zero is None else zero
+    state = (none + 0, none - 1, top, none + 0, none + 0, mi.Bool(active), zero)
+    return dr.while_loop(
+        state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
+    )[-1]
+
+
+class Packed:
+    """An array of unsigned integers, two to a word where 16 bits are enough."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.half = values.dtype == np.uint16
+        if self.half:
+            values = np.append(values, np.zeros(len(values) % 2, np.uint16)).view(np.uint32)
+        self.words = mi.UInt32(values)
+        self.nbytes = values.nbytes
+
+    def __getitem__(self, item):
+        """Gather, ``item`` = (index, active)."""
+        index, active = item
+        if not self.half:
+            return dr.gather(mi.UInt32, self.words, index, active)
+        word = dr.gather(mi.UInt32, self.words, index >> 1, active)
+        return (word >> ((index & 1) << 4)) & 0xFFFF
+
+
+class NormalCells:
+    """Division of a rectangle of projected normals into S×S cells.
+
+    S slabs along x, each cut into S cells along y, at places that are half uniform, half quantiles
+    of the map's normals: small cells where the normals, hence the queries, are many.
+    """
+
+    def __init__(self, lower, upper, slab_of_x: np.ndarray, cell_of_y: np.ndarray) -> None:
+        """``slab_of_x`` (RESOLUTION), ``cell_of_y`` (S, RESOLUTION): tables over the rectangle."""
+        self.lower, self.upper = (np.asarray(v, np.float32) for v in (lower, upper))
+        self.divisions = len(cell_of_y)
+        self.scale = (RESOLUTION / (self.upper - self.lower)).astype(np.float32)
+        self.slab_of_x = mi.UInt32(slab_of_x.astype(np.uint32))
+        self.cell_of_y = mi.UInt32(cell_of_y.astype(np.uint32).ravel())
+
+    @staticmethod
+    def histogram(normals: np.ndarray, lower, upper) -> np.ndarray:
+        """Number of normals (N, 2) per pixel of the tables, by x and y."""
+        pixel = ((normals - lower) * (RESOLUTION / (upper - lower))).astype(np.int64)
+        x, y = np.clip(pixel, 0, RESOLUTION - 1).T
+        counts = np.bincount(x * RESOLUTION + y, minlength=RESOLUTION**2)
+        return counts.reshape(RESOLUTION, RESOLUTION)
+
+    @staticmethod
+    def tables(histogram: np.ndarray, divisions: int):
+        """The tables ``(slab_of_x, cell_of_y)`` for normals with this histogram."""
+
+        def cut(counts):
+            mass = np.cumsum(counts) / max(counts.sum(), 1)
+            uniform = np.arange(1, RESOLUTION + 1) / RESOLUTION
+            before = 0.5 * (np.append(0, mass[:-1]) + np.append(0, uniform[:-1]))
+            return np.minimum(before * divisions, divisions - 1).astype(np.uint8)
+
+        slab_of_x = cut(histogram.sum(1))
+        slabs = np.zeros((divisions, RESOLUTION), np.int64)
+        np.add.at(slabs, slab_of_x, histogram)
+        return slab_of_x, np.stack([cut(counts) for counts in slabs])
+
+    def pixel(self, value, axis):
+        """Position of a coordinate in the table, in pixels."""
+        return (value - self.lower[axis]) * self.scale[axis]
+
+    def covers(self, m):
+        """Whether ``m`` lies in the rectangle."""
+        x, y = self.pixel(m.x, 0), self.pixel(m.y, 1)
+        return (x >= 0) & (x < RESOLUTION) & (y >= 0) & (y < RESOLUTION)
+
+    def slab(self, x, active=True):
+        index = mi.UInt32(dr.clip(self.pixel(x, 0), 0, RESOLUTION - 1))
+        return dr.gather(mi.UInt32, self.slab_of_x, index, active)
+
+    def cell_in_slab(self, slab, y, active=True):
+        index = mi.UInt32(dr.clip(self.pixel(y, 1), 0, RESOLUTION - 1))
+        return dr.gather(mi.UInt32, self.cell_of_y, slab * RESOLUTION + index, active)
+
+    def cell(self, m, active=True):
+        """Index of the cell of ``m``."""
+        slab = self.slab(m.x, active)
+        return slab * self.divisions + self.cell_in_slab(slab, m.y, active)
+
+    def edges(self) -> tuple[mi.Float, mi.Float]:
+        """Lower edges of the slabs (S + 1), and of the cells of each slab (S, S + 1), flat."""
+        wanted = np.arange(self.divisions + 1)
+        slabs = np.searchsorted(self.slab_of_x.numpy(), wanted)
+        cells = [
+            np.searchsorted(row, wanted)
+            for row in self.cell_of_y.numpy().reshape(self.divisions, RESOLUTION)
+        ]
+        x = self.lower[0] + slabs / self.scale[0]
+        y = self.lower[1] + np.concatenate(cells) / self.scale[1]
+        return mi.Float(x.astype(np.float32)), mi.Float(y.astype(np.float32))
+
+
+class Span(NamedTuple):
+    """Blocks along one axis: ``count`` from ``first`` on, block 0 following the last of ``all``."""
+
+    first: int
+    count: int
+    all: int
+
+    def place(self, block):
+        """Which of the span a block is (``mi.UInt32``)."""
+        place = block - self.first
+        if self.first + self.count > self.all:
+            place = dr.select(block < self.first, place + self.all, place)
+        return place
+
+    def block(self, place):
+        """The block at a place of the span (``mi.UInt32``)."""
+        block = place + self.first
+        if self.first + self.count > self.all:
+            block = dr.select(block >= self.all, block - self.all, block)
+        return block
+
+
+class Window(NamedTuple):
+    """A rectangle of blocks of quads."""
+
+    rows: Span
+    columns: Span
+
+    @staticmethod
+    def whole(lattice: Lattice) -> Window:
+        """All blocks."""
+        return Window(*(Span(0, axis.blocks, axis.blocks) for axis in (lattice.y, lattice.x)))
+
+    @staticmethod
+    def touched(lattice: Lattice, reach: Reach) -> Window:
+        """The blocks that footprints within the reach touch."""
+        touched = lattice.y.touched_blocks(*reach.rows), lattice.x.touched_blocks(*reach.columns)
+        axes = lattice.y, lattice.x
+        return Window(*(Span(*t, a.blocks) for t, a in zip(touched, axes, strict=True)))
+
+
+class QuadLists:
+    """The lists, of the arrays that :meth:`build` makes, wherever those were kept since.
+
+    ``window``: the blocks that have lists, all by default. Queries must not touch any other.
+
+    Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
+        ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
+        ``entries``: quads as ``column << SHIFT | row in block``;
+        ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
+    """
+
+    VERSION = 3
+
+    def __init__(
+        self, lattice: Lattice, arrays: dict[str, np.ndarray], window: Window | None = None
+    ) -> None:
+        self.lattice, self.window = lattice, window or Window.whole(lattice)
+        self.cells = NormalCells(
+            arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
+        )
+        # Taken out one by one: of a large map, no more than one need exist twice.
+        self.entries, self.offset = Packed(arrays.pop("entries")), Packed(arrays.pop("offset"))
+        self.start = mi.UInt32(arrays.pop("start"))
+        self.nbytes = self.entries.nbytes + self.offset.nbytes + 4 * dr.width(self.start)
+
+    def covers(self, m):
+        """Whether any quad may show the normal ``m``."""
+        return self.cells.covers(m)
+
+    def visit(self, m, kernel, add, active, zero=None) -> mi.Float:
+        """Sum over all quads that may show ``m`` under the kernel, beginning with ``zero``.
+
+        Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice,
+        ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
+        it returns the new ``density``. Sums are differentiable in both modes.
+        """
+        rows, columns = self.window
+        count, width = self.cells.divisions**2, columns.count + 1
+        cell = self.cells.cell(m, active)
+
+        def run_of(block_row, first, last, active):
+            list_index = rows.place(block_row) * count + cell
+            start = dr.gather(mi.UInt32, self.start, list_index, active)
+            return tuple(
+                start + self.offset[list_index * width + k, active]
+                for k in (columns.place(first), columns.place(last) + 1)
+            )
+
+        def quad_of(entry, row, found):
+            quad = mi.Int(self.entries[entry, found])
+            return row + (quad & (BLOCK - 1)), quad >> SHIFT
+
+        return walk(self.lattice, SHIFT, kernel, run_of, quad_of, add, active, zero)
+
+    # --------------------------------------------------------------------------------------------
+    #  Building
+    # --------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def build(
+        lattice: Lattice,
+        triangles,
+        normals: np.ndarray,
+        bounds,
+        window: Window | None = None,
+        bytes_per_quad: float = BYTES_PER_QUAD,
+    ) -> dict[str, np.ndarray]:
+        """Build the arrays, in two passes over the lattice, or a window of it: count, then fill.
+
+        ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
+        and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
+        rectangle (lower, upper), inside which all triangles lie; ``bytes_per_quad`` the memory
+        allowed.
+        """
+        window = window or Window.whole(lattice)
+        blocks = BlocksOfQuads(lattice, triangles, window)
+        return Builder(blocks, normals, bounds, bytes_per_quad).arrays()
+
+
+class Blocks:
+    """What :class:`Builder` makes lists of: things in blocks, whose normals lie in a few shapes.
+
+    A shape is three ``mi.Vector2f``; here it is a triangle, a vertex and two edges.
+
+    Attributes:
+        rows, columns (int): blocks.
+        mean_count (float): things in a block, on average.
+        largest_entry (int): bounds the entries.
+        shapes_each (int): shapes of a thing.
+    """
+
+    shapes_each = 2
+
+    @staticmethod
+    def extent(triangle):
+        """Lower and upper corner of a shape's bounding box."""
+        a, e1, e2 = triangle
+        b, c = a + e1, a + e2
+        return dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
+
+    @staticmethod
+    def meets(triangle, centre, half):
+        """Whether a shape meets a rectangle with this centre and these half extents."""
+        a, e1, e2 = triangle
+        a = a - centre
+        b, c = a + e1, a + e2
+        lower, upper = Blocks.extent((a, e1, e2))
+        meets = dr.all((lower <= half) & (upper >= -half))
+        for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
+            normal = mi.Vector2f(-edge.y, edge.x)  # a separating axis, if there is one
+            radius = dr.dot(dr.abs(normal), half)
+            p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
+            meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
+        return meets
+
+
+class BlocksOfQuads(Blocks):
+    """The quads of a window of a lattice."""
+
+    def __init__(self, lattice: Lattice, shapes, window: Window) -> None:
+        """``shapes(row, column, active)`` returns the shapes of a stored quad."""
+        self.lattice, self.shapes_of_quad = lattice, shapes
+        self.window = window
+        self.rows, self.columns = window.rows.count, window.columns.count
+        self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
+
+    def count(self, block_row, block_column):
+        """How many quads a block has."""
+        return BLOCK**2
+
+    def shapes(self, block_row, block_column, quad, active):
+        """Whether the ``quad``-th of a block exists, and its shapes."""
+        row = self.window.rows.block(block_row) * BLOCK + (quad >> SHIFT)
+        column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
+        exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
+        return exists, self.shapes_of_quad(row, column, exists)
+
+    def entry(self, block_row, block_column, quad):
+        """What the lists say of the ``quad``-th of a block."""
+        column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
+        return (column << SHIFT) | (quad >> SHIFT)
+
+
+class Builder:
+    """Scan of all quads against all cells they reach, one lane per block of quads.
+
+    A lane alone touches the counters of its block, so the order of the entries, and with it every
+    later sum, is the same on all machines.
+    """
+
+    def __init__(self, blocks, normals, bounds, bytes_per_quad: float = BYTES_PER_QUAD) -> None:
+        self.blocks, self.allowed = blocks, bytes_per_quad
+        self.lower, self.upper = (np.asarray(v, np.float32) for v in bounds)
+        self.histogram = NormalCells.histogram(normals, self.lower, self.upper)
+        self.rows, self.columns = blocks.rows, blocks.columns
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= self.allowed)
+        tables = self.use(divisions)
+        cells = divisions**2
+        index_type = np.uint16 if self.blocks.largest_entry < 1 << 16 else np.uint32
+
+        offset = np.zeros((self.rows, cells, self.columns + 1), index_type)
+        total = np.zeros((self.rows, cells), np.int64)
+        step = max(1, STRIP_COUNTERS // (cells * (self.columns + 1)))
+        strips = [slice(k, min(k + step, self.rows)) for k in range(0, self.rows, step)]
+        with progress("Building lists of quads") as report:
+            for done, strip in enumerate(strips):
+                counts = self.scan_strip(strip, np.zeros_like(offset[strip], np.uint32))
+                ends = np.cumsum(counts, axis=-1, dtype=np.uint32)
+                offset[strip, :, 1:] = ends[..., :-1]
+                total[strip] = ends[..., -1]
+                report(0.5 * (done + 1) / len(strips))
+            start = np.cumsum(total.ravel()) - total.ravel()
+
+            entries = np.empty(total.sum(), index_type)
+            for done, strip in enumerate(strips):
+                first = start[strip.start * cells]
+                count = total[strip].sum()
+                place = start.reshape(total.shape)[strip, :, None] - first + offset[strip]
+                entries[first : first + count] = self.scan_strip(
+                    strip, place.astype(np.uint32), count
+                )
+                report(0.5 + 0.5 * (done + 1) / len(strips))
+        return {
+            "lower": self.lower,
+            "upper": self.upper,
+            "slab_of_x": tables[0],
+            "cell_of_y": tables[1],
+            "start": start.astype(np.uint32),
+            "offset": offset.ravel(),
+            "entries": entries,
+        }
+
+    def use(self, divisions: int):
+        """Divide the normals into ``divisions``² cells; returns the tables."""
+        tables = NormalCells.tables(self.histogram, divisions)
+        self.cells = NormalCells(self.lower, self.upper, *tables)
+        self.slab_edges, self.cell_edges = self.cells.edges()
+        return tables
+
+    def bytes_per_quad(self, divisions: int) -> float:
+        """Memory of the lists with so many divisions, estimated from a sample of blocks."""
+        self.use(divisions)
+        sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
+        row, column = (mi.UInt32(v) for v in divmod(sample, self.columns))
+        counter = dr.zeros(mi.UInt32, 1)
+        self.scan(row, column, lambda cell: mi.UInt32(0), counter)
+        entries = counter[0] / (len(sample) * self.blocks.mean_count)
+        offsets = (2 + 6 / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
+        return 2 * entries + offsets
+
+    def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
+        """Scan the rows of blocks of a strip.
+
+        ``counters`` (rows, cells, columns + 1) count the quads per list and block. With
+        ``entries``, their number, they say where the next one goes, and the entries are returned.
+        """
+        shape = counters.shape
+        block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
+        row, column = block // self.columns, block % self.columns
+        counters = mi.UInt32(counters.ravel())
+        filled = None if entries is None else dr.zeros(mi.UInt32, max(int(entries), 1))
+        self.scan(
+            row + dr.opaque(mi.UInt32, strip.start),
+            column,
+            lambda cell: (row * shape[1] + cell) * shape[2] + column,
+            counters,
+            filled,
+        )
+        if filled is None:
+            return counters.numpy().reshape(shape)
+        return filled.numpy()[:entries]
+
+    def scan(self, block_row, block_column, counter_of_cell, counters, entries=None) -> None:
+        """For all quads of the given blocks, count or enter them in the cells that they reach."""
+        cells, blocks = self.cells, self.blocks
+        count = blocks.count(block_row, block_column)
+
+        def cell_range(slab, lower, upper, active):
+            return (
+                mi.Int(cells.cell_in_slab(mi.UInt32(slab), lower - MARGIN, active)),
+                mi.Int(cells.cell_in_slab(mi.UInt32(slab), upper + MARGIN, active)),
+            )
+
+        def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active):
+            quad = quad + 1
+            active = active & (quad < count)
+            exists, shapes = blocks.shapes(block_row, block_column, quad, active)
+            shapes = tuple(tuple(mi.Vector2f(v) for v in shape) for shape in shapes)
+            lower, upper = zip(*(blocks.extent(shape) for shape in shapes), strict=True)
+            lowest, highest = reduce(dr.minimum, lower), reduce(dr.maximum, upper)
+            slab = mi.Int(cells.slab(lowest.x - MARGIN, exists))
+            last_slab = dr.select(exists, mi.Int(cells.slab(highest.x + MARGIN, exists)), -1)
+            cell, last_cell = cell_range(slab, lowest.y, highest.y, exists)
+            return quad, slab, last_slab, cell, last_cell, lowest.y, highest.y, shapes, active
+
+        def body(*state):
+            state = dr.if_stmt(
+                state,
+                state[-1] & (state[1] > state[2]),
+                next_quad,
+                lambda *state: state,
+                label="next quad",
+            )
+            quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active = state
+            inside = active & (slab <= last_slab)
+            s, c = mi.UInt32(slab), mi.UInt32(cell)
+            x = [dr.gather(mi.Float, self.slab_edges, s + k, inside) for k in range(2)]
+            index = s * (cells.divisions + 1) + c
+            y = [dr.gather(mi.Float, self.cell_edges, index + k, inside) for k in range(2)]
+            centre = mi.Vector2f(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
+            half = mi.Vector2f(0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])) + MARGIN
+            met = reduce(or_, (blocks.meets(shape, centre, half) for shape in shapes))
+            found = inside & met
+            slot = dr.scatter_inc(counters, counter_of_cell(s * cells.divisions + c), found)
+            if entries is not None:
+                dr.scatter(entries, blocks.entry(block_row, block_column, quad), slot, found)
+
+            cell = cell + 1
+            next_slab = inside & (cell > last_cell)
+            slab = dr.select(next_slab, slab + 1, slab)
+            first_cell, final_cell = cell_range(slab, lower, upper, next_slab & (slab <= last_slab))
+            cell = dr.select(next_slab, first_cell, cell)
+            last_cell = dr.select(next_slab, final_cell, last_cell)
+            return quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active
+
+        n = dr.width(block_row)
+        none, zero = dr.zeros(mi.Int, n), dr.zeros(mi.Float, n)
+        shapes = tuple(
+            tuple(dr.zeros(mi.Vector2f, n) for _ in range(3)) for _ in range(blocks.shapes_each)
+        )
+        state = (
+            dr.full(mi.UInt32, 0xFFFFFFFF, n),
+            none + 0,
+            none - 1,
+            none + 0,
+            none - 1,
+            zero + 0,
+            zero + 0,
+            shapes,
+            dr.full(mi.Bool, True, n),
+        )
+        dr.while_loop(state, lambda *state: state[-1], body, label="scan of quads")
+        dr.eval(counters, entries)

@@ -1,0 +1,1 @@
+"""The position-normal manifold (Wu, Luan, Hašan and Ramamoorthi 2024)."""

@@ -1,0 +1,111 @@
+"""Diffuse reflection of the facets under a footprint.
+
+Each class gives ``f cosθ_o`` of a white surface, 1/steradian. Directions are unit vectors of the
+upper hemisphere, in the local shading frame.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.footprint.domain import Reach
+from glintbsdf.pndf.filters.moments import MomentPyramid
+from glintbsdf.pndf.manifold.exact import TexelMesh
+from glintbsdf.pndf.manifold.projected_area import LOWEST, ProjectedArea
+
+
+class FacetDiffuse:
+    """All facets under the footprint, each diffuse: f_d = P(ω) / (π ω_z), ω towards the light.
+
+    Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
+    High-Resolution Normal Maps" (2024), section 4.3, Eq. 14. The facets count with their own area,
+    1/m_z that of the surface, and neither hide nor light each other: what they reflect of uniform
+    light is the mean of (1 + 1/m_z)/2, which is above 1 by the mean squared slope over 4.
+
+    Args:
+        mesh (TexelMesh): the manifold.
+    """
+
+    def __init__(self, mesh: TexelMesh) -> None:
+        self.area = ProjectedArea(mesh)
+
+    def parameters_changed(self) -> None:
+        """Follow a change of the mesh's data."""
+        self.area.parameters_changed()
+
+    def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
+        """``f_d cosθ_o``. The light is at ``wo``, or at ``wi`` where importance is transported."""
+        if mode == mi.TransportMode.Importance:
+            return self.area.eval(wi, footprint, active) * wo.z / (pi * wi.z)
+        return self.area.eval(wo, footprint, active) / pi
+
+    def __repr__(self) -> str:
+        return "manifold"
+
+
+class OrenNayarDiffuse:
+    """The filtered surface: Oren and Nayar's model around the mean normal of the footprint.
+
+    Wu24, appendix C: the mean of the projected normals gives the frame, the variance of the slopes
+    the roughness, as in LEADR mapping (Dupuy et al. 2013), with σ² half the trace of the slopes'
+    covariance. The model is the "qualitative" one of Oren and Nayar, "Generalization of Lambert's
+    Reflectance Model", SIGGRAPH 1994, without interreflection.
+
+    Args:
+        mesh (TexelMesh): gives the normals; its triangles play no part.
+        reach (Reach): what will be asked for, see ``MomentPyramid``.
+
+    Attributes:
+        parts (dict[str, int]): memory of each part, bytes.
+    """
+
+    def __init__(self, mesh: TexelMesh, reach: Reach | None = None) -> None:
+        self.mesh, self.reach = mesh, reach
+        self.parameters_changed()
+
+    @property
+    def parts(self) -> dict[str, int]:
+        return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.pyramid.nbytes}
+
+    def parameters_changed(self) -> None:
+        """Average anew the data of the mesh."""
+        self.pyramid = MomentPyramid(
+            self.mesh.data,
+            self.mesh.normal_map.wrap_mode,
+            slope_moments,
+            reach=self.reach,
+        )
+
+    def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
+        """``f cosθ_o``; zero where either direction is below the mean facet. Reciprocal."""
+        x, y, slope_x, slope_y, squared = self.pyramid.average(footprint)
+        variance = 0.5 * dr.maximum(squared - slope_x * slope_x - slope_y * slope_y, 0)
+        frame = mi.Frame3f(mi.Normal3f(x, y, dr.safe_sqrt(1 - x * x - y * y)))
+        return oren_nayar(frame.to_local(wi), frame.to_local(wo), variance)
+
+    def __repr__(self) -> str:
+        return f"oren_nayar[{self.pyramid.nbytes / 2**20:.1f} MiB]"
+
+
+def slope_moments(m: mi.Vector2f) -> list:
+    """Projected normal, slope, and squared slope of a facet."""
+    slope = m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
+    return [m.x, m.y, slope.x, slope.y, dr.squared_norm(slope)]
+
+
+def oren_nayar(wi: mi.Vector3f, wo: mi.Vector3f, variance: mi.Float) -> mi.Float:
+    """``f cosθ_o`` of a white rough surface (Oren and Nayar 1994).
+
+    ``variance``: σ², that of the facets' inclination, radians².
+    """
+    active = (wi.z > 0) & (wo.z > 0)
+    a = 1 - 0.5 * variance / (variance + 0.33)
+    b = 0.45 * variance / (variance + 0.09)
+    # cos(φ_i − φ_o) sin α tan β, with sinθ_i sinθ_o cos(φ_i − φ_o) the product of the projections:
+    # the larger angle has the smaller cosine.
+    product = dr.fma(wi.x, wo.x, wi.y * wo.y)
+    across = dr.maximum(product, 0) / dr.select(active, dr.maximum(wi.z, wo.z), 1)
+    return dr.select(active, (a + b * across) * wo.z / pi, 0)

@@ -1,0 +1,444 @@
+"""The P-NDF of a synthesised map, from lobes of the MIP level that suits the footprint.
+
+Tan, Zhu, Xu, Meng, Wang and Yan, "Real-Time Microstructure Rendering with MIP-mapped Normal Map
+Samples" (2022), section 5.2. The map is made from a small sample
+(:mod:`glintbsdf.maps.quilting`); its lobes are those of the sample, gathered to few per grid on
+each MIP level (:mod:`glintbsdf.pndf.mip.levels`).
+
+Of a level, all lobes of the grids that the footprint reaches count, each by the closed form of
+:mod:`glintbsdf.pndf.gaussian_elements`; their sum is divided by the sum of their masses, so that D
+integrates to one whatever the footprint. With λ between two levels, both are blended; in the
+paper's Eq. 9 the weights have changed places.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+from math import inf, log2, pi
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.cache import load_or_build
+from glintbsdf.core.errors import check, check_whole
+from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
+from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.quilting import VERSION as MAP_VERSION
+from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
+from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
+from glintbsdf.pndf.manifold.exact import add_where
+from glintbsdf.pndf.mip import levels as lobe_levels
+from glintbsdf.pndf.mip import packing as packed_lobes
+from glintbsdf.pndf.mip.cells import Grids
+from glintbsdf.pndf.mip.packing import NORMAL_CUT, Lobe
+
+#: Width of a footprint in standard deviations, a pixel's by default: its area in Eq. 8 is that of a
+#: square as wide.
+WIDTH = 2.0
+
+#: A footprint more elongated than this counts as wider in Eq. 8, which limits the cost.
+MAX_ANISOTROPY = 16.0
+
+
+#: Squared distance, in standard deviations of footprint and lobe together, from which on lobes of
+#: grids count for nothing: 0.4 % of the mass.
+GRID_CUT = 12.25
+
+#: Lobes per turn of the loop, whose overhead would otherwise cost as much as a lobe.
+PER_TURN = 4
+
+
+class Mip:
+    """P-NDF of a large map synthesised from a sample (Tan et al. 2022).
+
+    Belongs to the variant of Mitsuba that is active when it is made. The unit square of UV is the
+    large map. Its ``wrap_mode`` is the sample's: to ``repeat``, its edges are made to fit;
+    ``mirror`` mirrors it; ``clamp`` does so too, and holds the footprint's centre inside.
+
+    Args:
+        normal_map (NormalMap): the sample.
+        output_size, patch_size, overlap, balance, seed: see
+            :func:`~.synthesise`.
+        clusters (int): k, lobes per grid of each level, from 1 to 1024.
+        lod_scale (float): C_P ≥ 0 of Eq. 8, λ = C_P log₂ P with P the footprint's area in texels,
+            (2σ)² for a round one. With 1/2, a level's grids are as wide as the footprint.
+        sigma_r (float): intrinsic roughness, the standard deviation of normals about those of the
+            map, in [1e-8, 1].
+        normal_weight (float): weight ≥ 0 of normals against positions where lobes are clustered;
+            see :class:`~.Clustering`.
+        owner (str): whom errors name, usually the plugin.
+
+    Attributes:
+        data (mi.TensorXf): projected normals of the sample, h×w×2. After a change of its values,
+            :meth:`parameters_changed` rebuilds everything.
+        sigma_r (mi.Float): the roughness. Derivatives flow through it.
+        synthesis (Synthesis): the large map.
+
+    Raises :class:`~.ParameterError`.
+    """
+
+    #: For references: the footprint is a Gaussian, and no triangle is clamped.
+    kernel, epsilon = "gaussian", 0.0
+
+    def __init__(
+        self,
+        normal_map: NormalMap,
+        output_size: int = 4096,
+        patch_size: int = 64,
+        overlap: int | None = None,
+        clusters: int = 32,
+        lod_scale: float = 0.5,
+        balance: float = 0.9,
+        sigma_r: float = 0.005,
+        seed: int = 0,
+        normal_weight: float = 8.0,
+        owner: str = "Mip",
+    ) -> None:
+        sample = (normal_map.height, normal_map.width)
+        overlap = check_sizes(sample, output_size, patch_size, overlap, owner)
+        check_whole(clusters, lambda k: 1 <= k <= 1024, owner, "clusters", "from 1 to 1024")
+        check(0 <= lod_scale < 16, owner, "lod_scale", "a number in [0, 16)", lod_scale)
+        check(0 <= normal_weight < inf, owner, "normal_weight", "a number ≥ 0", normal_weight)
+        self.clusters, self.lod_scale, self.owner = clusters, float(lod_scale), owner
+        self.normal_weight = float(normal_weight)
+        self.options = {
+            "output_size": output_size,
+            "patch_size": patch_size,
+            "overlap": overlap,
+            "balance": balance,
+            "seed": seed,
+        }
+        self.wrap_mode = normal_map.wrap_mode
+        self.sigma_r = mi.Float(sigma_r)
+        check_sigma_r(owner, sigma_r)
+        self.data = mi.TensorXf(normal_map.normals)
+        self.build(normal_map)
+
+    def build(self, sample: NormalMap) -> None:
+        """Synthesise the map and cluster its lobes; the cache on disk may know them already."""
+        distinct = len(np.unique(sample.normals.view(np.complex64)))
+        if distinct < self.clusters:
+            warnings.warn(
+                f"{self.owner}: the sample has {distinct} distinct normals, fewer than "
+                f'"clusters" = {self.clusters}: lobes that differ in position only are kept apart',
+                stacklevel=2,
+            )
+        options = {**self.options, "toroidal": self.wrap_mode == "repeat"}
+        key = " ".join(
+            (
+                f"mip {MAP_VERSION}.{lobe_levels.VERSION}.{packed_lobes.VERSION}",
+                sample.content_hash,
+                *(f"{name}={value!r}" for name, value in options.items()),
+                f"{self.clusters} {self.normal_weight}",
+            )
+        )
+
+        def build() -> dict:
+            synthesis = synthesise(sample, **options, owner=self.owner)
+            levels = lobe_levels.build(
+                synthesis, self.clusters, self.normal_weight, self.options["seed"]
+            )
+            return {**synthesis.arrays(), **levels}
+
+        arrays = load_or_build(key, build)
+        self.__dict__.pop("normal_map", None)
+        self.synthesis = Synthesis.from_arrays(
+            sample.normals, self.options["output_size"], self.options["overlap"], arrays
+        )
+        self.grids = Grids(
+            self.synthesis, arrays, self.clusters, mirrored=self.wrap_mode != "repeat"
+        )
+        self.words = mi.UInt32(lobe_levels.all_words(arrays))
+        # λ at which a level's grids are as wide as it says: log2 of their width, rounded
+        layout = self.grids.layout
+        self.cell_level = round(log2(layout.inner))
+        self.finest_level = self.cell_level - len(layout.divisions)
+        dr.eval(self.words)
+
+    # --------------------------------------------------------------------------------------------
+    #  Section 5.2.1: levels and lobes
+    # --------------------------------------------------------------------------------------------
+
+    def texel_kernel(self, footprint, added: mi.Float | None = None) -> TexelKernel:
+        """The footprint on the map's texels, widened by the variance ``added`` (texels²)."""
+        size = self.synthesis.size
+        added = SIGMA_MIN**2 if added is None else added + SIGMA_MIN**2
+        wrap_mode = self.wrap_mode
+        if wrap_mode == "clamp":
+            footprint = Footprint(dr.clip(footprint.uv, 0, 1), footprint.du, footprint.dv)
+            wrap_mode = "mirror"
+        return TexelKernel("gaussian", footprint, size, size, wrap_mode, added=(added, added))
+
+    def level(self, kernel: TexelKernel) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
+        """Eq. 8: the levels below and above λ, and the weight of the one above (Eq. 9).
+
+        The levels are indices of :class:`~.Grids`. Between texels and the
+        finest grids that there are, λ belongs to the texels.
+        """
+        variance = dr.square(kernel.sigma_u) + dr.square(kernel.sigma_v)
+        major = variance - kernel.minor_variance
+        minor = dr.maximum(kernel.minor_variance, major * (1 / MAX_ANISOTROPY**2))
+        area = WIDTH**2 * dr.sqrt(major * minor)
+        scaled = self.lod_scale * dr.log2(area) - (self.finest_level - 1)
+        scaled = dr.clip(scaled, 0, self.grids.levels - 1)
+        below = dr.floor(scaled)
+        fraction = scaled - below
+        above = dr.select(fraction > 0, below + 1, below)
+        return mi.UInt32(below), mi.UInt32(above), fraction
+
+    def visit(self, footprint, kernel, level, add, state: tuple, active) -> tuple:
+        """Call ``state = add(state, lobe, offset, sign, active)`` for all lobes that count.
+
+        ``offset`` (texels) is the footprint's centre as seen from the origin of the lobe's
+        positions, in the frame of the lobe's copy of the map, whose axes a mirrored map flips:
+        ``sign``. One flat loop, :data:`PER_TURN` lobes a turn. What is not summed is whole numbers:
+        Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
+        """
+        grids, mirrored = self.grids, self.wrap_mode != "repeat"
+        with dr.suspend_grad():
+            # A texel's lobe is as wide as a texel: those around the footprint count as well. It
+            # stands between this texel and the next; in a mirror image, the one before.
+            texels = level == 0
+            width, shift = (SIGMA_H + 0.5 / 3, 0.0) if mirrored else (SIGMA_H, 0.5)
+            reach = self.texel_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
+            reach.cut_at(dr.select(texels, dr.sqrt(self.texel_cut(kernel)), REACH["gaussian"]))
+            centre = mi.Vector2f(reach.mean) + dr.select(texels, 0.5 - shift, 0.5)
+            axis = grids.axis.on(level, active)
+            top = axis.locate(centre.y - reach.reach_v)
+            bottom = axis.locate(centre.y + reach.reach_v)
+        mean = mi.Vector2f(kernel.mean) + 0.5  # from the map's edge
+
+        def next_row(y, x, right):
+            y = y + 1
+            index, turn, flipped = axis.at(y)
+            borders = [
+                axis.placed(axis.border(index + k), turn, flipped) - centre.y for k in (0, 1)
+            ]
+            start, stop = reach.row_extent(dr.minimum(*borders), dr.maximum(*borders))
+            return y, axis.locate(centre.x + start), axis.locate(centre.x + stop)
+
+        def next_grid(first, count, first_2, count_2, y, x, right, origin, sign):
+            y, x, right = dr.if_stmt(
+                (y, x + 1, right),
+                x + 1 > right,
+                next_row,
+                lambda *state: state,
+                label="next row",
+            )
+            inside = y <= bottom
+            row, turn_y, flipped_y = axis.at(y)
+            column, turn_x, flipped_x = axis.at(x)
+            first, count, first_2, count_2 = grids.run(level, axis, row, column, flipped_x, inside)
+            origin = mi.Vector2i(
+                axis.placed(axis.origin(column), turn_x, flipped_x),
+                axis.placed(axis.origin(row), turn_y, flipped_y),
+            )
+            if mirrored:
+                sign = mi.Vector2i(dr.select(flipped_x, -1, 1), dr.select(flipped_y, -1, 1))
+            # Texels of a run are grids of their own.
+            count = dr.select(texels, dr.minimum(count, mi.UInt32(right - x + 1)), count)
+            x = dr.select(texels, x + mi.Int(count) - 1, x)
+            return first, count, first_2, count_2, y, x, right, origin, sign
+
+        def next_run(first, count, first_2, count_2, *rest):
+            return dr.if_stmt(
+                (first_2, count_2, mi.UInt32(first), mi.UInt32(0), *rest),
+                count_2 == 0,
+                next_grid,
+                lambda *state: state,
+                label="next grid",
+            )
+
+        def body(state, walk):
+            walk = dr.if_stmt(
+                walk,
+                active & (walk[1] == 0),
+                next_run,
+                lambda *walk: walk,
+                label="next run",
+            )
+            first, count, first_2, count_2, y, x, right, origin, sign = walk
+            inside = active & (y <= bottom)
+            axes = mi.Vector2f(sign) if mirrored else mi.Vector2f(1)
+            for k in range(PER_TURN):
+                found = inside & (count > k)
+                place = mi.Vector2i(origin.x + dr.select(texels, k, 0), origin.y)
+                offset = (mean - mi.Vector2f(place)) * axes
+                lobe = Lobe(self.words, first + k, found)
+                state = add(state, lobe, offset, axes, found)
+            taken = dr.minimum(count, PER_TURN)
+            origin = mi.Vector2i(origin.x + dr.select(texels, mi.Int(taken), 0), origin.y)
+            count = dr.select(inside, count - taken, count)
+            return state, (first + taken, count, first_2, count_2, y, x, right, origin, sign)
+
+        walk = (
+            *(mi.UInt32(0) for _ in range(4)),
+            top - 1,
+            mi.Int(0),
+            mi.Int(-1),
+            mi.Vector2i(0),
+            mi.Vector2i(1),
+        )
+        state, _ = dr.while_loop(
+            (state, walk),
+            lambda state, walk: active & (walk[4] <= bottom),
+            body,
+            max_iterations=-1,
+            label="lobes",
+        )
+        return state
+
+    # --------------------------------------------------------------------------------------------
+    #  Section 5.2.2: evaluation and sampling
+    # --------------------------------------------------------------------------------------------
+
+    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk (Eq. 9); 0 outside of it.
+
+        ``footprint``: a :class:`~.Footprint`, in the UV space of the large map.
+        """
+        kernel = self.texel_kernel(footprint)
+        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+        below, above, fraction = self.level(kernel)
+        density = self.level_density(m, footprint, kernel, below, active)
+        blended = active & (fraction > 0)
+        finer = dr.select(blended, 1 - fraction, 1) * density
+        return finer + fraction * self.level_density(m, footprint, kernel, above, blended)
+
+    def level_density(self, m, footprint, kernel, level, active) -> mi.Float:
+        """D(m) of one level."""
+        variance = dr.square(self.sigma_r)
+        active = active & self.grids.may_have(m, level, NORMAL_CUT * self.sigma_r, active)
+        cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
+        summed = self.mass_is_summed(level)
+
+        def add(state, lobe, offset, sign, active):
+            near = lobe.may_show(m, variance)
+
+            def added(density, mass):
+                seen = lobe.under(offset, extent, *self.seen(kernel, sign))
+                weight = seen.weight(cut)
+                density = add_where(
+                    density,
+                    near & (weight > 0),
+                    lambda: weight * seen.normals().eval(m, variance),
+                    active,
+                )
+                return density, mass + weight
+
+            return where_needed(active & (near | summed), added, state)
+
+        density, mass = self.visit(
+            footprint, kernel, level, add, (mi.Float(0), mi.Float(0)), active
+        )
+        mass = dr.select(summed, mass, self.mass_of_texels(kernel))
+        return dr.select(mass > 0, density / dr.select(mass > 0, mass, 1), 0)
+
+    def cut(self, kernel: TexelKernel, level: mi.UInt32) -> mi.Float:
+        """Squared distance at which lobes are cut."""
+        return dr.select(level == 0, self.texel_cut(kernel), GRID_CUT)
+
+    def texel_cut(self, kernel: TexelKernel) -> mi.Float:
+        """Squared distance at which lobes of texels are cut, so that their mass is known."""
+        return cut_of_lists(dr.sqrt(kernel.minor_variance + SIGMA_H**2))
+
+    def mass_is_summed(self, level: mi.UInt32) -> mi.Bool:
+        """Whether the mass of all lobes is to be summed. Those of texels are a lattice, whose mass
+        is known, but where a mirrored map has two at its edge, or none."""
+        return (level > 0) | (self.wrap_mode != "repeat")
+
+    def mass_of_texels(self, kernel: TexelKernel) -> mi.Float:
+        """The sum of the weights of all lobes of texels, which stand at whole numbers."""
+        first, second = self.seen(kernel, mi.Vector2f(1))[0]
+        xx = dr.fma(first.x, first.x, dr.fma(second.x, second.x, SIGMA_H**2))
+        yy = dr.fma(second.y, second.y, SIGMA_H**2)
+        mass = lattice_mass(mi.Vector2f(kernel.mean) + 0.5, xx, second.x * second.y, yy)
+        return 2 * pi * mass_under_fade(self.texel_cut(kernel)) * mass
+
+    def sample(
+        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    ) -> mi.Vector2f:
+        """Draw a projected normal with density D: a level, a lobe of it, a normal of the lobe.
+
+        The lobe is chosen by a weighted reservoir: the next one takes the place of the last with
+        probability weight/total so far. One that falls outside the disk is an invalid sample.
+        """
+        kernel = self.texel_kernel(footprint)
+        active = mi.Bool(active)
+        below, above, fraction = self.level(kernel)
+        bits, name, _ = pcg3d(dr.reinterpret_array(mi.UInt32, mi.Float(sample1)), 0, 0)
+        level = dr.select(uniform(bits) < fraction, above, below)
+
+        cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
+
+        def add(state, lobe, offset, sign, active):
+            mass, turn, index, place, side = state
+            weight = lobe.under(offset, extent, *self.seen(kernel, sign)).weight(cut)
+            mass = mass + weight
+            chosen = uniform(pcg3d(turn, name, 0)[0]) * mass < weight
+            return (
+                mass,
+                turn + 1,
+                dr.select(chosen, lobe.index, index),
+                dr.select(chosen, offset, place),
+                dr.select(chosen, sign, side),
+            )
+
+        state = mi.Float(0), mi.UInt32(0), mi.UInt32(0), mi.Vector2f(0), mi.Vector2f(1)
+        state = self.visit(footprint, kernel, level, add, state, active)
+        mass, _, index, place, side = state
+        active &= mass > 0
+        lobe = Lobe(self.words, index, active)
+        seen = lobe.under(place, extent, *self.seen(kernel, side))
+        normal = mi.warp.square_to_std_normal(mi.Point2f(sample2))
+        return seen.normals().sample(normal, dr.square(self.sigma_r))
+
+    def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> tuple[tuple, mi.Float]:
+        """Two vectors that make up the footprint's covariance (texels²), in the frame of a copy of
+        the map, and its determinant."""
+        vectors = (
+            mi.Vector2f(kernel.sigma_u_given_v, 0),
+            mi.Vector2f(kernel.shear * kernel.sigma_v, kernel.sigma_v),
+        )
+        if self.wrap_mode != "repeat":
+            vectors = tuple(v * sign for v in vectors)
+        return vectors, dr.square(kernel.sigma_u_given_v * kernel.sigma_v)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)
+        callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str] = ()) -> None:
+        """Check what has changed; a new sample makes everything anew."""
+        check_sigma_r(self.owner, self.sigma_r[0])
+        if not keys or "data" in keys:
+            self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
+
+    @cached_property
+    def normal_map(self) -> NormalMap:
+        """The large map, for references: as large as what is saved by not storing it."""
+        return self.synthesis.normal_map()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of lobes and look-up tables, bytes."""
+        return 4 * dr.width(self.words) + self.grids.nbytes
+
+    def __repr__(self) -> str:
+        return (
+            f"Mip[{self.synthesis}, clusters={self.clusters}, lod_scale={self.lod_scale:g}, "
+            f"sigma_r={self.sigma_r[0]:g}, {self.wrap_mode}, {self.nbytes / 1e6:.1f} MB]"
+        )
+
+
+def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
+    """``added(*sums)`` in the lanes that need it, in a branch; with derivatives, in all, as
+    :func:`~.add_where` does."""
+    if dr.grad_enabled(added(*sums)):
+        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
+    return dr.if_stmt(sums, needed, added, lambda *sums: sums)

@@ -1,0 +1,246 @@
+"""What a scene asks of its glint BSDFs, what they build for it, and building no more than that.
+
+A survey renders the scene with few samples and notes the part of each map and the footprints that
+its BSDF is asked for, along whole paths, by the scene's own sensor and integrator. The BSDFs are
+then built for these, and a margin (``reach.py``). Within them a trimmed BSDF answers as a complete
+one, to the last bit; that nothing else has been asked for is checked after every pass of the
+rendering. If something has, all is built in full, and the rendering begins again: the image is the
+same in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.footprint.domain import NOTHING, Gate, Reach, Recorder, waiting
+from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.scene import rendering
+
+#: Paths of a survey, about: a second's work of two CPU cores.
+PATHS = 1 << 18
+
+SEED = 0x5EED
+
+#: Memory that a report mentions, bytes.
+NOTABLE = 1e5
+
+
+class Missed(Exception):
+    """A trimmed BSDF has been asked for what it has not built."""
+
+
+@dataclass
+class Inspected:
+    """A scene and its glint BSDFs, in the order in which Mitsuba has made them."""
+
+    scene: mi.Scene
+    bsdfs: list
+
+
+def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> Inspected:
+    """Load a scene from XML, its glint BSDFs not yet built as far as they can wait."""
+    with waiting() as bsdfs:
+        return Inspected(rendering.load_scene(filename, parameters), bsdfs)
+
+
+def survey(inspected: Inspected, spp: int | None = None) -> list[Reach | None]:
+    """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel.
+
+    None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect as
+    smooth surfaces meanwhile: later bounces of the paths go where theirs may go, if not as often.
+    Mitsuba's ``path`` asks a BSDF where a path ends as well, for nothing: that counts.
+
+    Raises:
+        ValueError: see :func:`~.render`.
+    """
+    scene = inspected.scene
+    sensor = rendering.first_sensor(scene)
+    sampler = sensor.sampler()
+    own = sampler.sample_count()
+
+    def rounded(count: int) -> int:  # as the sampler requires it
+        sampler.set_sample_count(count)
+        return sampler.sample_count()
+
+    spp = rounded(spp or own)
+    pixels = int(np.prod(sensor.film().crop_size()))
+    few = rounded(min(spp, max(1, PATHS // pixels)))
+    maps = [map_of(bsdf) for bsdf in inspected.bsdfs]
+    recorders = [normal_map and Recorder(normal_map) for normal_map in maps]
+    for bsdf, recorder in zip(inspected.bsdfs, recorders, strict=True):
+        bsdf.watch = recorder
+    try:
+        with rendering.footprints(scene, sensor, spp, spp / few):
+            scene.integrator().render(scene, sensor, seed=SEED, spp=few)
+        return [recorder and recorder.found() for recorder in recorders]
+    finally:
+        for bsdf in inspected.bsdfs:
+            bsdf.watch = None
+        sampler.set_sample_count(own)
+
+
+def map_of(bsdf: object) -> NormalMap | None:
+    """The map of a BSDF, whether or not it can be built for a part of it."""
+    return bsdf.normal_map or getattr(getattr(bsdf, "pndf", None), "normal_map", None)
+
+
+def able_to_wait(inspected: Inspected) -> list:
+    """The BSDFs that can be built late."""
+    return [bsdf for bsdf in inspected.bsdfs if bsdf.normal_map is not None]
+
+
+def build(inspected: Inspected) -> None:
+    """Build all BSDFs in full that have waited."""
+    for bsdf in able_to_wait(inspected):
+        bsdf.build()
+        bsdf.watch = None
+
+
+def build_trimmed(inspected: Inspected, reaches: list[Reach | None]) -> None:
+    """Build all BSDFs that have waited for their reaches and a margin; without a reach, not at all.
+
+    Args:
+        inspected: from :func:`load`, nothing built yet.
+        reaches: from :func:`survey`.
+    """
+    for bsdf, reach in zip(inspected.bsdfs, reaches, strict=True):
+        if bsdf.normal_map is None:
+            continue
+        bsdf.watch = Gate(bsdf.normal_map, NOTHING if reach is None else reach.widened())
+        if reach is not None:
+            bsdf.build(reach.widened())
+
+
+def render_trimmed(
+    inspected: Inspected,
+    render: Callable[[Callable[[], None]], mi.Bitmap],
+    spp: int | None = None,
+) -> tuple[mi.Bitmap, bool]:
+    """Render with BSDFs that hold no more than the scene asks for.
+
+    Args:
+        inspected: from :func:`load`.
+        render: function that renders ``inspected.scene``, in passes perhaps, and calls the function
+            it is given after each.
+        spp: samples per pixel of ``render``, None for the scene's.
+
+    Returns:
+        The image, and whether trimmed BSDFs have sufficed. Where they have not, all is built in
+        full and rendered once more.
+    """
+
+    trimmed = able_to_wait(inspected)
+
+    def check() -> None:
+        if any(bsdf.watch.missed() for bsdf in trimmed):
+            raise Missed
+
+    build_trimmed(inspected, survey(inspected, spp))
+    try:
+        return render(check), True
+    except Missed:
+        build(inspected)
+        return render(lambda: None), False
+
+
+# ------------------------------------------------------------------------------------------------
+#  Report
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of one glint BSDF of a scene.
+
+    Attributes:
+        plugin, name (str): its type and its id.
+        normal_map (NormalMap): None for one without a map.
+        reach (Reach): what it is asked for, None for nothing, or where there is no map.
+        complete, trimmed (dict[str, int]): memory of each part, bytes; the same where nothing can
+            be trimmed.
+        left_out (list[str]): what its parameters leave out of what is built and evaluated.
+    """
+
+    plugin: str
+    name: str
+    normal_map: NormalMap | None
+    reach: Reach | None
+    complete: dict[str, int]
+    trimmed: dict[str, int]
+    left_out: list[str]
+
+    def __str__(self) -> str:
+        lines = [f'{self.plugin} "{self.name}"' if self.name else self.plugin]
+        lines += self.lines("map", self.asked())
+        lines += self.lines("built", amounts(self.complete))
+        saved = sum(self.complete.values()) - sum(self.trimmed.values())
+        if saved >= NOTABLE:
+            lines += self.lines("--trim", [*amounts(self.trimmed), f"{saved / 1e6:8.1f} MB  saved"])
+        elif self.normal_map is not None:
+            lines += self.lines("--trim", ["saves nothing here"])
+        lines += self.lines("left out", self.left_out)
+        return "\n".join(lines)
+
+    @staticmethod
+    def lines(title: str, entries: list[str]) -> list[str]:
+        """Entries under each other, beside their title."""
+        titles = [title] + [""] * len(entries)
+        return [f"  {t:10}{entry}" for t, entry in zip(titles, entries, strict=False)]
+
+    def asked(self) -> list[str]:
+        """Lines about what of the map is asked for."""
+        if self.normal_map is None:
+            return ["none"]
+        width, height = self.normal_map.width, self.normal_map.height
+        lines = [f"{width} × {height} texels, {self.normal_map.wrap_mode}"]
+        if self.reach is None:
+            return [*lines, "no path meets it"]
+        share = 1.0
+        for (first, last), texels in ((self.reach.columns, width), (self.reach.rows, height)):
+            share *= min((last - first + 1) / texels, 1)
+        ranges = [
+            f"{axis} {(first + 0.5) / texels:.4g} to {(last + 0.5) / texels:.4g}"
+            for axis, (first, last), texels in (
+                ("u", self.reach.columns, width),
+                ("v", self.reach.rows, height),
+            )
+        ]
+        return [
+            *lines,
+            f"asked for: {', '.join(ranges)}, {100 * share:.3g} % of the map",
+            f"footprints: standard deviations of {self.reach.smallest:.3g} to "
+            f"{self.reach.largest:.3g} texels",
+        ]
+
+
+def amounts(parts: dict[str, int]) -> list[str]:
+    """Memory by parts, and their sum."""
+    notable = {name: size for name, size in parts.items() if size >= NOTABLE}
+    if not notable:
+        return ["next to nothing"]
+    if len(notable) > 1:
+        notable["together"] = sum(parts.values())
+    return [f"{size / 1e6:8.1f} MB  {name}" for name, size in notable.items()]
+
+
+def inspect(inspected: Inspected, spp: int | None = None) -> list[Finding]:
+    """What each BSDF is asked for and builds, and what of that ``render --trim`` would build.
+
+    Args:
+        inspected: from :func:`load`.
+        spp: samples per pixel of the rendering, None for the scene's: footprints depend on it.
+    """
+    reaches = survey(inspected, spp)
+    build_trimmed(inspected, reaches)
+    trimmed = [bsdf.parts() for bsdf in inspected.bsdfs]
+    build(inspected)
+    reaches = survey(inspected, spp)  # once more, by the glints themselves
+    return [
+        Finding(bsdf.owner, bsdf.name, map_of(bsdf), reach, bsdf.parts(), parts, bsdf.left_out())
+        for bsdf, reach, parts in zip(inspected.bsdfs, reaches, trimmed, strict=True)
+    ]

@@ -1,0 +1,70 @@
+"""Plugins are known in every variant, whatever the order of imports and changes of variant."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from glintbsdf.bridge import registration
+
+
+def a_plugin() -> dict:
+    return {"type": "glint_manifold", "data": dr.zeros(mi.TensorXf, (2, 2, 2))}
+
+
+def test_plugin_types_are_the_plugin_modules():
+    assert {"glint_manifold", "glint_path"} <= set(registration.plugin_types())
+
+
+def test_plugins_survive_changes_of_variant(variant):
+    other = variant.replace("rgb", "mono") if "rgb" in variant else variant
+    for name in (variant, "scalar_rgb", other, variant, other, variant):
+        mi.set_variant(name)
+        if not name.startswith("scalar"):
+            bsdf = mi.load_dict(a_plugin())
+            assert isinstance(bsdf, mi.BSDF)
+            assert isinstance(mi.load_dict({"type": "glint_path"}), mi.Integrator)
+
+
+@pytest.mark.parametrize("plugin_type", registration.plugin_types())
+def test_kind_of_a_plugin_is_the_same_in_scalar_variants(plugin_type, variant):
+    mi.set_variant("scalar_rgb")
+    mi.set_variant(variant)
+    try:
+        mi.load_dict({"type": plugin_type})
+    except RuntimeError as error:  # that parameters are missing does not matter here
+        assert "Type mismatch" not in str(error)
+
+
+def test_each_variant_has_the_plugins(each_variant):
+    assert isinstance(mi.load_dict(a_plugin()), mi.BSDF)
+
+
+def test_objects_of_a_former_variant_still_work(variant):
+    if "rgb" not in variant:
+        pytest.skip("needs an RGB variant to change from")
+    bsdf = mi.load_dict(a_plugin())
+    mi.set_variant(variant.replace("rgb", "mono"))
+    mi.set_variant(variant)
+    assert "GlintManifold" in str(bsdf)
+
+
+def test_installing_again_registers_once(variant, monkeypatch):
+    calls = []
+    monkeypatch.setattr(registration, "register", calls.append)
+    registration.install()
+    registration.install()
+    calls.clear()
+    mi.set_variant("scalar_rgb")
+    assert calls == ["scalar_rgb"]
+
+
+@pytest.mark.parametrize("plugin", ["bsdf:glint_manifold", "integrator:glint_path"])
+def test_scalar_variant_is_refused_with_the_lines_to_type(plugin):
+    kind, plugin_type = plugin.split(":")
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(RuntimeError) as error:
+        mi.load_string(f'<scene version="3.0.0"><{kind} type="{plugin_type}"/></scene>')
+    assert f"{plugin_type}: needs a JIT variant of Mitsuba" in str(error.value)
+    assert 'mi.set_variant("llvm_ad_rgb")' in str(error.value)

@@ -1,0 +1,424 @@
+"""The command line, run in this process: what it writes, sets, prints and refuses."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from glintbsdf import NormalMap, maps
+from glintbsdf.cli import entry as cli
+from glintbsdf.scene import rendering
+
+SCENE = """<scene version="3.0.0">
+    <default name="size" value="16"/>
+    <default name="spp" value="16"/>
+    <default name="sampler" value="independent"/>
+    <default name="spread" value="0"/>
+    <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+    <sensor type="perspective">
+        <float name="fov" value="30"/>
+        <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="$size"/>
+            <integer name="height" value="$size"/>
+            <rfilter type="box"/>
+        </film>
+        <sampler type="$sampler"><integer name="sample_count" value="$spp"/></sampler>
+    </sensor>
+    <emitter type="constant"/>
+    <shape type="rectangle">
+        <bsdf type="twosided">
+            <bsdf type="glint_manifold">
+                <string name="filename" value="map.exr"/>
+                <float name="pixel_spread" value="$spread"/>
+            </bsdf>
+        </bsdf>
+    </shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder, made the current one, with a small scene in it and its map."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.xml").write_text(SCENE)
+    heights = np.random.default_rng(1).random((16, 16, 1), dtype=np.float32)
+    mi.set_variant("scalar_rgb")
+    mi.Bitmap(heights).write("map.exr")
+    return tmp_path
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, variant):
+    """Run the command line; return its exit status, its output and its errors."""
+
+    def run(*arguments: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["glintbsdf", *map(str, arguments)])
+        if arguments and arguments[0] in ("render", "pndf") and "-m" not in arguments:
+            sys.argv += ["-m", variant]
+        with pytest.raises(SystemExit) as exit:
+            cli.main()
+        captured = capsys.readouterr()
+        code = exit.value.code
+        if isinstance(code, str):  # what Python does with sys.exit("message")
+            return 1, captured.out, captured.err + code + "\n"
+        return code, captured.out, captured.err
+
+    return run
+
+
+# ---------------------------------------------------------------------------------------------
+#  render
+# ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_render_writes_the_image_and_nothing_else(run, folder, name):
+    before = set(folder.iterdir())
+    status, output, errors = run("render", "scene.xml", "-o", name)
+    assert (status, output, errors) == (0, f"{name}\n", "")
+    assert set(folder.iterdir()) - before == {folder / name}
+    image = np.array(mi.Bitmap(str(folder / name)))
+    assert image.shape == (16, 16, 3)
+    assert image.dtype == (np.float32 if name.endswith("exr") else np.uint8)
+    assert image.mean() > 0
+
+
+def test_output_has_the_permissions_of_a_new_file(run, folder):
+    (folder / "plain").touch()
+    assert run("render", "scene.xml")[0] == 0
+    assert (folder / "scene.exr").stat().st_mode == (folder / "plain").stat().st_mode
+
+
+def test_seed_decides_the_image(run, folder):
+    images = []
+    for seed in (3, 3, 4):
+        assert run("render", "scene.xml", "--seed", seed, "--spp", 4)[0] == 0
+        images.append(np.array(mi.Bitmap("scene.exr")))
+    assert np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_definitions_reach_the_scene(run, folder):
+    assert run("render", "scene.xml", "-D", "size=8", "-D", "sampler=multijitter")[0] == 0
+    assert np.array(mi.Bitmap("scene.exr")).shape == (8, 8, 3)
+
+
+def test_aov_images(run, folder):
+    text = SCENE.replace(
+        '<integrator type="path"><integer name="max_depth" value="2"/>',
+        '<integrator type="aov"><string name="aovs" value="dd:depth"/><integrator type="path"/>',
+    )
+    (folder / "aov.xml").write_text(text)
+    assert run("render", "aov.xml", "--spp", 1)[0] == 0
+    assert "dd.T" in [field.name for field in mi.Bitmap("aov.exr").struct_()]
+    assert run("render", "aov.xml", "--spp", 1, "-o", "aov.png")[0] == 0
+    colours = np.array(mi.Bitmap("aov.png"))
+    assert colours.shape == (16, 16, 3) and colours.mean() > 128
+
+
+def test_one_thread_does_not_hang(run, folder):
+    """Mitsuba would wait for ever for a second thread while it reads the OpenEXR environment."""
+    text = SCENE.replace(
+        '<emitter type="constant"/>',
+        '<emitter type="envmap"><string name="filename" value="map.exr"/></emitter>',
+    )
+    (folder / "envmap.xml").write_text(text)
+    count = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        assert run("render", "envmap.xml", "--spp", 1)[0] == 0
+    finally:
+        dr.set_thread_count(count)
+
+
+@pytest.mark.parametrize(
+    "arguments, expected_status, message",
+    [
+        (["render", "missing.xml"], 2, "File 'missing.xml' does not exist"),
+        (["render", "scene.xml", "-o", "out.jpg"], 2, 'must end in .exr or .png (got "out.jpg")'),
+        (["render", "scene.xml", "--spp", "0"], 2, "0 is not in the range x>=1"),
+        (["render", "scene.xml", "-D", "spp"], 2, 'must be key=value (got "spp")'),
+        (["render", "scene.xml", "-m", "scalar_rgb"], 2, 'must be one of llvm_ad_rgb'),
+        (["render", "scene.xml", "-D", "nothing=1"], 1, "unused parameters: - $nothing=1"),
+        (["render", "scene.xml", "-D", "spread=-1"], 1, '"pixel_spread" must be a finite number'),
+        (["render", "scene.xml", "-o", "nowhere/out.exr"], 1, "cannot write to nowhere/out.exr"),
+        (["render", "no_sensor.xml"], 1, "no sensor"),
+        (["render", "no_uvs.xml"], 1, 'the mesh "bare" has no UV coordinates'),
+        (["render", "broken.xml"], 1, "broken.xml"),
+        (["nonsense"], 2, "No such command 'nonsense'"),
+    ],
+)  # fmt: skip
+def test_errors_are_one_line_and_leave_nothing(run, folder, arguments, expected_status, message):
+    (folder / "no_sensor.xml").write_text('<scene version="3.0.0"/>')
+    (folder / "broken.xml").write_text('<scene version="3.0.0">')
+    bare = '<shape type="obj" id="bare"><string name="filename" value="bare.obj"/>'
+    (folder / "no_uvs.xml").write_text(SCENE.replace('<shape type="rectangle">', bare))
+    (folder / "bare.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    before = set(folder.iterdir())
+    status, output, errors = run(*arguments)
+    assert status == expected_status
+    assert message in errors
+    assert errors.startswith("Error: ") and errors.count("\n") == 1 and "Traceback" not in errors
+    assert output == ""
+    assert set(folder.iterdir()) == before
+
+
+def test_debug_shows_the_traceback(run, folder, monkeypatch):
+    with pytest.raises(RuntimeError, match="unused parameters"):
+        monkeypatch.setattr(
+            sys, "argv", ["glintbsdf", "--debug", "render", "scene.xml", "-D", "nothing=1"]
+        )
+        cli.main()
+
+
+def test_unwritable_output_is_reported_before_rendering(run, folder, monkeypatch):
+    monkeypatch.setattr(rendering, "load_scene", pytest.fail)
+    (folder / "out.exr").mkdir()
+    status, _, errors = run("render", "scene.xml", "-o", "out.exr")
+    assert status == 1 and "out.exr is a folder" in errors
+
+
+def test_a_failed_rendering_keeps_the_former_image(run, folder, monkeypatch):
+    (folder / "scene.exr").write_text("former")
+
+    def fail(*_):
+        raise RuntimeError("half way")
+
+    monkeypatch.setattr(rendering, "save", fail)
+    before = set(folder.iterdir())
+    assert run("render", "scene.xml")[0] == 1
+    assert (folder / "scene.exr").read_text() == "former"
+    assert set(folder.iterdir()) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
+def test_interruption_leaves_nothing(folder, variant):
+    before = set(folder.iterdir())
+    command = [sys.executable, "-m", "glintbsdf", "render", "scene.xml", "-m", variant]
+    process = subprocess.Popen(
+        [*command, "-D", "size=512", "--spp", "65536"], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while set(folder.iterdir()) == before and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.5)  # into loading or rendering
+        os.kill(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=120)
+    finally:
+        process.kill()  # one that does not end would slow all that follows
+    assert process.returncode == 1
+    assert errors.strip() == "Aborted."
+    assert set(folder.iterdir()) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
+def test_interruption_under_another_name():
+    """Dr.Jit's loops and Mitsuba's constructors replace the exception that ends them."""
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), cli.interruptible():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as error:
+            raise RuntimeError("dr.while_loop(): encountered an exception") from error
+    with pytest.raises(RuntimeError, match="of its own"), cli.interruptible():
+        raise RuntimeError("of its own")
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+# ---------------------------------------------------------------------------------------------
+#  Footprints and passes
+# ---------------------------------------------------------------------------------------------
+
+
+def footprint_parameters(scene: mi.Scene) -> tuple[float, float]:
+    parameters = mi.traverse(scene)
+    (spread,) = (parameters[key][0] for key in parameters.keys() if key.endswith("pixel_spread"))
+    (sigma,) = (parameters[key][0] for key in parameters.keys() if key.endswith("footprint_sigma"))
+    return spread, sigma
+
+
+def test_pixel_angle_is_that_of_the_field_of_view(folder, variant):
+    sensor = rendering.load_scene("scene.xml", {"size": "256"}).sensors()[0]
+    expected = 2 * np.tan(np.radians(30) / 2) / 256
+    # Differences of two unit vectors in float32, 6e-8 of 2e-3.
+    assert rendering.pixel_angle(sensor) == pytest.approx(expected, rel=1e-4)
+
+
+def test_pixel_angle_of_a_parallel_projection_is_zero(variant):
+    assert rendering.pixel_angle(mi.load_dict({"type": "orthographic"})) == 0
+
+
+@pytest.mark.parametrize("passes", [1, 4])
+@pytest.mark.parametrize("own_spread", [0.0, 0.01])
+def test_passes_have_the_footprint_of_the_whole_image(folder, variant, passes, own_spread):
+    """What a BSDF sees is σ times the spread of a pass, and σ times the differentials of a pass."""
+    scene = rendering.load_scene("scene.xml", {"spread": str(own_spread)})
+    sensor = scene.sensors()[0]
+    before = footprint_parameters(scene)
+    with rendering.footprints(scene, sensor, 16, passes):
+        spread, sigma = footprint_parameters(scene)
+    assert footprint_parameters(scene) == before
+    whole = own_spread or rendering.pixel_angle(sensor) / np.sqrt(16)
+    assert spread * sigma == pytest.approx(0.5 * whole, rel=1e-5)
+    assert sigma / np.sqrt(16 / passes) == pytest.approx(0.5 / np.sqrt(16), rel=1e-5)
+
+
+@pytest.mark.parametrize("spp, pixels, count", [
+    (16, 100, 1),  # a small image is rendered at once
+    (16, 1 << 18, 16),  # at most one pass per sample
+    (64, 1 << 14, 4),
+    (12, 1 << 17, 6),  # passes of equal size only
+    (13, 1 << 16, 1),
+    (1, 1 << 24, 1),
+])  # fmt: skip
+def test_pass_count(spp, pixels, count):
+    assert rendering._pass_count(spp, pixels) == count
+
+
+def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
+    """The same light in one pass and in eight, within the noise of both."""
+    images = {}
+    for size in (1 << 18, 512):
+        monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", size)
+        fractions = []
+        scene = rendering.load_scene("scene.xml")
+        bitmap = rendering.render(scene, 16, 0, fractions.append)
+        assert scene.sensors()[0].sampler().sample_count() == 16
+        passes = len(fractions)
+        images[passes] = np.array(bitmap)
+        assert fractions == [(index + 1) / passes for index in range(passes)]
+    assert set(images) == {1, 8}
+    assert not np.array_equal(images[1], images[8])
+    # A white furnace seen in a mirror: the image differs from 1 by lost multiple reflections only.
+    # Means of 16 x 16 pixels of 16 samples: standard error measured below 0.01.
+    assert images[1].mean() == pytest.approx(images[8].mean(), abs=0.04)
+
+
+def test_stratified_samplers_render_in_one_pass(folder, variant, monkeypatch):
+    monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", 256)
+    fractions = []
+    scene = rendering.load_scene("scene.xml", {"sampler": "multijitter"})
+    rendering.render(scene, report=fractions.append)
+    assert fractions == [1]
+
+
+def test_each_variant_renders(folder, each_variant):
+    image = np.array(rendering.render(rendering.load_scene("scene.xml", {"size": "4"}), 1))
+    assert np.isfinite(image).all() and image.max() > 0
+
+
+# ---------------------------------------------------------------------------------------------
+#  pndf
+# ---------------------------------------------------------------------------------------------
+
+PNDF = ["pndf", "--type", "glint_manifold", "--map", "map.exr", "--uv", 0.3, 0.6, "--sigma", 2]
+
+
+def test_pndf_draws_and_agrees_with_the_reference(run, folder):
+    status, output, errors = run(*PNDF, "--res", 32)
+    assert (status, errors) == (0, "")
+    difference, noise = (
+        float(word.strip("%,")) for word in output.split("\n")[0].split() if "%" in word
+    )
+    # With 32 x 32 bins of 16 points: noise about 10 %, and what it expects is what is seen.
+    assert difference < 1.5 * noise
+    assert "queries in" in output
+    assert np.array(mi.Bitmap("pndf.png")).shape == (32, 2 * 32 + 8, 3)
+
+
+def test_pndf_passes_parameters_on(run, folder):
+    _, gaussian, _ = run(*PNDF, "--res", 16)
+    _, box, _ = run(*PNDF, "--res", 16, "-D", "kernel=box", "-D", "height_scale=1.0")
+    assert gaussian.split("\n")[0] != box.split("\n")[0]
+
+
+@pytest.mark.parametrize("extra, message", [
+    (["-D", "kernel=gauss"], 'glint_manifold: "kernel" must be one of gaussian, disk, box'),
+    (["-D", "nothing=1"], "unreferenced property"),
+    (["--type", "diffuse"], "unreferenced property"),
+    (["--sigma", "nan"], "must be"),
+    (["-o", "pndf.pdf"], "must end in .exr or .png"),
+])  # fmt: skip
+def test_pndf_errors(run, folder, extra, message):
+    before = set(folder.iterdir())
+    status, _, errors = run(*PNDF, *extra)
+    assert status in (1, 2)
+    assert message in errors and errors.count("\n") == 1
+    assert set(folder.iterdir()) == before
+
+
+# ---------------------------------------------------------------------------------------------
+#  Messages
+# ---------------------------------------------------------------------------------------------
+
+
+# ---------------------------------------------------------------------------------------------
+#  synthesise
+# ---------------------------------------------------------------------------------------------
+
+
+def test_synthesise_writes_the_map_of_glint_mip(run, folder, variant):
+    sample = maps.isotropic(40, seed=1)
+    channels = np.dstack((sample.normals, np.sqrt(1 - (sample.normals**2).sum(axis=2))))
+    OpenEXR.File({}, {"RGB": channels}).write("sample.exr")
+    sizes = ("--output-size", 100, "--patch-size", 20, "--seed", 3)
+    status, output, errors = run("synthesise", "sample.exr", "-o", "large.exr", *sizes)
+    assert (status, errors) == (0, "")
+    mi.set_variant(variant)  # the folder has left another
+    assert output.startswith("40×40 texels made 100×100") and output.endswith("large.exr\n")
+    bsdf = mi.load_dict(
+        {
+            "type": "glint_mip",
+            "filename": "sample.exr",
+            "output_size": 100,
+            "patch_size": 20,
+            "seed": 3,
+        }
+    )
+    large = NormalMap.load("large.exr").normals
+    assert np.allclose(large, bsdf.pndf.normal_map.normals, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-o", "large.png"), "must end in .exr"),
+        (("-o", "large.exr", "--patch-size", "9999"), 'synthesise: "patch_size" must be'),
+    ],
+)
+def test_synthesise_errors(run, folder, arguments, message):
+    OpenEXR.File({}, {"Y": np.zeros((40, 40), np.float32)}).write("sample.exr")
+    status, output, errors = run("synthesise", "sample.exr", *arguments)
+    assert status != 0 and output == "" and message in errors and errors.count("\n") == 1
+    assert not list(Path().glob("large*"))
+
+
+def test_errors_of_python_plugins_lose_their_traceback():
+    message = (
+        "[parser.cpp:1718] At scene.xml (line 3): failed to instantiate bsdf plugin of type "
+        '"x": Traceback (most recent call last):\n  File "a.py", line 1, in <lambda>\n'
+        '  File "b.py", line 2, in check\n'
+        'glintbsdf.core.errors.ParameterError: x: "k" must be 1 (got 2)'
+    )
+    assert cli.one_line(message) == (
+        'At scene.xml (line 3): failed to instantiate bsdf plugin of type "x": '
+        'x: "k" must be 1 (got 2)'
+    )
+
+
+def test_help_names_the_commands(run):
+    status, output, _ = run("--help")
+    assert status == 0 and all(name in output for name in ("render", "pndf", "doctor"))

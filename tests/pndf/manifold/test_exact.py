@@ -1,0 +1,228 @@
+"""The P-NDF of the manifold as such; what the BSDF makes of it is in test_glint_manifold.py."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from glintbsdf import NormalMap, maps
+from glintbsdf.core import cache
+from glintbsdf.core.errors import ParameterError
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import KERNELS
+from glintbsdf.pndf import Manifold
+from glintbsdf.pndf.index.lists import QuadLists
+from glintbsdf.pndf.manifold import exact as manifold
+
+SHAPES = [(64, 48), (37, 53), (3, 5), (1, 1), (1, 70)]
+
+
+def noise(shape, wrap_mode="repeat", spread=0.05):
+    normals = np.random.default_rng(1).normal(scale=spread, size=(*shape, 2))
+    return NormalMap(normals.astype(np.float32), wrap_mode)
+
+
+def random_footprints(count, seed=2, largest=0.3):
+    """Rotated ones, from 0.002 maps on, at places up to three maps away."""
+    rng = np.random.default_rng(seed)
+    uv = rng.random((2, count)) * 6 - 3
+    sigma = np.exp(rng.uniform(np.log(0.002), np.log(largest), (2, count)))
+    turn = 2 * np.pi * rng.random(count)
+    axes = (
+        np.stack([np.cos(turn), np.sin(turn)]) * sigma[0],
+        (np.stack([-np.sin(turn), np.cos(turn)]) * sigma[1]),
+    )
+    return Footprint(
+        *(
+            t(v.astype(np.float32))
+            for t, v in zip((mi.Point2f, mi.Vector2f, mi.Vector2f), (uv, *axes), strict=True)
+        )
+    )
+
+
+def draw(pndf, footprint, count, seed=3):
+    u = np.random.default_rng(seed).random((2, count), dtype=np.float32)
+    m = pndf.sample(footprint, 0.0, mi.Point2f(mi.Float(u[0]), mi.Float(u[1])))
+    dr.eval(m)
+    return m
+
+
+@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_lists_equal_the_loop_over_all_quads(variant, monkeypatch, shape, wrap_mode):
+    pndf = Manifold(noise(shape, wrap_mode))
+    footprint = random_footprints(2000)
+    m = draw(pndf, footprint, 2000)
+    density = {}
+    for few in (0, np.inf):
+        monkeypatch.setattr(manifold, "FEW_QUADS", few)
+        density[few] = pndf.eval(m, footprint).numpy()
+    # Equal but for the order of the sum: 2e-6 was measured.
+    assert np.allclose(density[0], density[np.inf], rtol=1e-5, atol=1e-3)
+    assert (density[0] > 0).mean() > 0.998  # all but samples on the very edge of the kernel
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_both_ways_give_the_same_where_they_meet(variant, monkeypatch, kernel):
+    """Footprints around FEW_QUADS, every lane choosing for itself: as if all took one way."""
+    normal_map = maps.isotropic(64, seed=1)
+    pndf = Manifold(normal_map, kernel)
+    sigma = mi.Float(np.linspace(0.3, 3, 4000).astype(np.float32) / 64)
+    footprint = Footprint(mi.Point2f(0.3, 0.7), mi.Vector2f(sigma, 0), mi.Vector2f(0, sigma))
+    m = draw(pndf, footprint, 4000)
+    together = pndf.eval(m, footprint).numpy()
+    kernels = pndf.texel_kernel(footprint)
+    few = kernels.touched_quads().numpy() <= manifold.FEW_QUADS
+    assert few.any() and not few.all() and (together > 0).mean() > 0.998
+    monkeypatch.setattr(manifold, "FEW_QUADS", np.inf)
+    # Equal but for the order of the sum, as above.
+    assert np.allclose(together, pndf.eval(m, footprint).numpy(), rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test_derivatives_of_lists_equal_those_of_the_loop_over_all_quads(variant, monkeypatch, mode):
+    normal_map = maps.isotropic(64, seed=1)
+    derivatives = {}
+    for few in (manifold.FEW_QUADS, np.inf):
+        monkeypatch.setattr(manifold, "FEW_QUADS", few)
+        pndf, sigma = Manifold(normal_map), mi.Float(0.08)
+        footprint = Footprint.isotropic(mi.Point2f(mi.Float(0.3, 0.6, 0.9), 0.7), sigma)
+        m = draw(pndf, footprint, 3)
+        dr.enable_grad(sigma)
+        footprint = Footprint.isotropic(footprint.uv, sigma)
+        density = dr.sum(pndf.eval(m, footprint))
+        if mode == "forward":
+            dr.forward(sigma)
+            derivatives[few] = dr.grad(density)[0]
+        else:
+            dr.backward(density)
+            derivatives[few] = dr.grad(sigma)[0]
+    lists, loop = derivatives.values()
+    assert loop != 0
+    assert np.isclose(lists, loop, rtol=1e-4)  # the order of the sum: 1e-6 was measured
+
+
+def test_mirroring_is_repetition_of_the_unfolded_map(variant):
+    normals = noise((16, 24)).normals
+    unfolded = np.concatenate([normals, normals[::-1]], axis=0)
+    unfolded = np.concatenate([unfolded, unfolded[:, ::-1]], axis=1)
+    mirrored, repeated = Manifold(NormalMap(normals, "mirror")), Manifold(NormalMap(unfolded))
+    footprint = random_footprints(1000, largest=0.2)
+    half = Footprint(footprint.uv / 2, footprint.du / 2, footprint.dv / 2)
+    m = draw(mirrored, footprint, 1000)
+    a, b = mirrored.eval(m, footprint).numpy(), repeated.eval(m, half).numpy()
+    # Positions are rounded differently: 1e-6 of three maps, which the edge of a kernel shows.
+    assert (np.abs(a - b) <= 1e-3 * (a + b)).mean() > 0.995
+
+
+def test_far_outside_a_clamped_map_only_its_corner_is_seen(variant):
+    normal_map = noise((8, 8), "clamp")
+    pndf = Manifold(normal_map)
+    footprint = Footprint.isotropic(mi.Point2f(-4, -5), 0.1)
+    m = np.array(draw(pndf, footprint, 100))
+    # All triangles there are clamped ones around the corner's normal, of circumradius 6.2e-4.
+    assert np.abs(m - normal_map.normals[0, 0][:, None]).max() < 6.3e-4
+
+
+def test_zero_outside_of_the_disk_and_of_the_map(variant):
+    pndf = Manifold(noise((16, 16)))
+    m = mi.Vector2f([0.0, 0.9, 2.0, -1.0, float("nan")], [0.8, 0.0, 2.0, 0.5, 0.0])
+    footprint = Footprint.isotropic(mi.Point2f(0.5), 0.2)
+    assert np.array_equal(pndf.eval(m, footprint).numpy(), np.zeros(5))
+    inactive = pndf.eval(mi.Vector2f(0), footprint, active=False)
+    assert inactive.numpy() == 0
+
+
+def test_density_of_a_constant_gradient(variant):
+    """n(u) = G u has the density k/|det G|: a Gaussian, known in closed form."""
+    size, slope = 256, 1e-3
+    i, j = np.indices((size, size))
+    normals = np.stack([slope * (j - size / 2), 2 * slope * (i - size / 2)], -1)
+    pndf = Manifold(NormalMap(normals.astype(np.float32), "clamp"))
+    sigma = 12.0
+    footprint = Footprint.isotropic(mi.Point2f(0.5), sigma / size)
+    x = np.random.default_rng(1).uniform(-0.02, 0.02, (2, 500))
+    m = mi.Vector2f(x.astype(np.float32))
+    density = pndf.eval(m, footprint).numpy()
+    u = np.stack([x[0] / slope, x[1] / (2 * slope)]) + 0.5  # texels from the footprint's centre
+    rho2 = (u**2).sum(0) / sigma**2
+    expected = np.exp(-0.5 * rho2) / (2 * np.pi * sigma**2 * (1 - np.exp(-4.5)) * 2 * slope**2)
+    # float32 normals: a relative 1e-4 of a texel's step, in position and in det J.
+    assert np.allclose(density, expected, rtol=2e-3)
+
+
+def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
+    """Across a step all are; their determinants, 0, are rounded to more than this epsilon."""
+    normals = np.zeros((32, 32, 2), np.float32)
+    normals[:, :16], normals[:, 16:] = (-0.3, 0), (0.6, 0.1)
+    pndf, middle, count = Manifold(NormalMap(normals), epsilon=1e-9), (0.15, 0.05), 100_000
+    footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.2)
+    s = np.array(draw(pndf, footprint, count))
+    drawn = (np.abs(s - np.array(middle)[:, None]) < 1e-3).all(axis=0).mean()
+    half = 1.1 * manifold.equilateral(1e-9)[0][1]  # of a square about all of their normals
+    s = np.array(middle)[:, None] + half * np.random.default_rng(4).uniform(-1, 1, (2, count))
+    mass = pndf.eval(mi.Vector2f(np.float32(s)), footprint).numpy().mean() * (2 * half) ** 2
+    # 0.03: their noise is 2 %; half of the triangles had been drawn, but not evaluated.
+    assert 0.02 < drawn and abs(mass / drawn - 1) < 0.1
+
+
+def test_memory(variant):
+    """64 MB are allowed for 1024²."""
+    assert Manifold(maps.isotropic(1024, seed=1)).nbytes <= 64e6
+
+
+def test_lists_are_cached_and_equal(variant, monkeypatch, tmp_path):
+    monkeypatch.setenv("GLINTBSDF_CACHE", str(tmp_path))
+    first = Manifold(noise((40, 40)))
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+
+    def refuse(*args):
+        raise AssertionError("built again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(QuadLists, "build", refuse)
+        second = Manifold(noise((40, 40)), kernel="box")  # the lists do not depend on the kernel
+    assert np.array_equal(first.lists.entries.words.numpy(), second.lists.entries.words.numpy())
+    for other in ({"epsilon": 1e-5}, {}):
+        Manifold(noise((40, 40), wrap_mode="mirror" if not other else "repeat"), **other)
+    assert len(list(tmp_path.glob("*.npz"))) == 3
+
+
+def test_a_damaged_cache_is_rebuilt(variant, monkeypatch, tmp_path):
+    monkeypatch.setenv("GLINTBSDF_CACHE", str(tmp_path))
+    first = Manifold(noise((40, 40)))
+    (file,) = tmp_path.glob("*.npz")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    second = Manifold(noise((40, 40)))
+    assert np.array_equal(first.lists.entries.words.numpy(), second.lists.entries.words.numpy())
+    assert cache.directory() == tmp_path and len(file.read_bytes()) == len(whole)
+
+
+def test_new_data_are_checked_and_used(variant):
+    pndf = Manifold(noise((16, 16)))
+    other = noise((16, 16), spread=0.1)
+    pndf.data = mi.TensorXf(other.normals)
+    pndf.parameters_changed(["data"])
+    footprint = random_footprints(500)
+    m = draw(pndf, footprint, 500)
+    assert np.array_equal(
+        pndf.eval(m, footprint).numpy(), Manifold(other).eval(m, footprint).numpy()
+    )
+    pndf.data = mi.TensorXf(np.full((16, 16, 2), np.nan, np.float32))
+    with pytest.raises(ParameterError, match="256 NaN or infinite"):
+        pndf.parameters_changed(["data"])
+
+
+@pytest.mark.parametrize("epsilon", [0, -1, 1, float("nan")])
+def test_epsilon_must_be_a_small_positive_number(variant, epsilon):
+    with pytest.raises(ParameterError, match=r'Manifold: "epsilon" must be a number in \(0, 1\)'):
+        Manifold(noise((4, 4)), epsilon=epsilon)
+
+
+def test_lists_hold_no_more_than_memory_allows_for_white_noise(variant):
+    """Triangles that span the whole range of normals reach into every cell."""
+    pndf = Manifold(noise((128, 128), spread=0.3 / 3))
+    assert pndf.nbytes <= 61 * 128**2
