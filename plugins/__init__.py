@@ -19,16 +19,42 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
      the map in use: the projected normals, H×W×2.
    - |exposed|, |differentiable|
 
+ * - layer
+   - |string|
+   - Layer of an OpenEXR file that has several. (Default: one called "normal", or "height" for a
+     height; else that without a name)
+
  * - map_type
    - |string|
-   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z) in [−1, 1]; :monosp:`height`, which
-     gives normals ∝ (−∂h/∂x, −∂h/∂y, 1); or :monosp:`auto`, a height where there is one channel or
-     all channels are equal. Files of unsigned integers are decoded from [0, 1].
-     (Default: :monosp:`auto`)
+   - What the map holds: :monosp:`normal`, (x, y) or (x, y, z); :monosp:`height`, which gives the
+     facets of the displaced surface; or :monosp:`auto`, a height where there is one channel or
+     three that are equal but for a few levels. See :doc:`/maps`. (Default: :monosp:`auto`)
 
  * - height_scale
    - |float|
-   - Texels per unit of height. (Default: 1)
+   - Texels per unit of height, from −1e9 to 1e9; integers are fractions of their range.
+     (Default: 1)
+
+ * - encoding
+   - |string|
+   - How components of normals are stored: :monosp:`signed`, in [−1, 1]; :monosp:`unsigned`, as
+     (n + 1)/2; or :monosp:`auto`, as the numbers look, whatever the file's type. What was decided
+     is logged where the type alone would not tell. (Default: :monosp:`auto`)
+
+ * - flip_y
+   - |bool|
+   - Whether green points down in the image, as DirectX has it, rather than up. Where it is not
+     given and the normals of the map speak for it, there is a warning. (Default: |false|)
+
+ * - strength
+   - |float|
+   - Factor on the slopes of the map, from 0 to 1000. (Default: 1)
+
+ * - fill_voids
+   - |bool|
+   - Whether texels that hold nothing take the normal of the nearest that do, rather than being
+     refused: NaN, the black or transparent padding of an atlas, and a height's −9999, −32767,
+     −32768 or what the file names. How many is logged. (Default: |false|)
 
  * - wrap_mode
    - |string|
@@ -42,7 +68,7 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
 
  * - footprint_sigma
    - |float|
-   - Standard deviation of the footprint, in pixels. (Default: 0.5)
+   - Standard deviation of the footprint, in pixels, from 0 to 100. (Default: 0.5)
    - |exposed|, |differentiable|, |discontinuous|
 
  * - pixel_spread
@@ -50,7 +76,7 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
    - Angle of a pixel in radians, divided by the square root of the samples per pixel, as Mitsuba
      scales ray differentials. The footprint follows from it where the integrator gives none:
      Mitsuba's own integrators give none, :ref:`glint_path <integrator-glint_path>` does, and
-     :monosp:`glintbsdf render` sets this parameter by itself. (Default: 0)
+     :monosp:`glintbsdf render` sets this parameter by itself. From 0 to π. (Default: 0)
    - |exposed|, |differentiable|, |discontinuous|
 
  * - material
@@ -59,15 +85,16 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
 
  * - eta, k
    - |spectrum| or |texture|
-   - Real and imaginary part of the index of refraction, instead of :monosp:`material`.
+   - Real and imaginary part of the index of refraction, from 0 to 1000, instead of
+     :monosp:`material`.
      (Default: 0 and 1 where only the other is given)
    - |exposed|, |differentiable|, |discontinuous|
 
  * - int_ior, ext_ior
    - |float| or |string|
-   - Indices of refraction inside and outside of a dielectric, or names such as :monosp:`bk7`,
-     instead of a metal. Only its reflection is modelled: what is transmitted is absorbed. (Default:
-     :monosp:`bk7` and :monosp:`air` where only the other is given)
+   - Indices of refraction inside and outside of a dielectric, from 0.001 to 1000, or names such as
+     :monosp:`bk7`, instead of a metal. Only its reflection is modelled: what is transmitted is
+     absorbed. (Default: :monosp:`bk7` and :monosp:`air` where only the other is given)
 
  * - specular_reflectance
    - |spectrum| or |texture|

@@ -6,7 +6,8 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
 
 .. pluginparameters::
 
- * Shared: filename, bitmap, data, map_type, height_scale, wrap_mode, to_uv
+ * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,
+   fill_voids, wrap_mode, to_uv
 
  * - sigma_r
    - |float|
@@ -138,7 +139,7 @@ class GlintElements(GlintBSDF):
                 parameters.number("flake_density", 0.0),
                 parameters.number("flake_alpha", 0.2),
                 sigma_r,
-                props.get("seed", 0),
+                parameters.whole("seed", 0),
                 self.owner,
             )
             self.masking = BeckmannMasking(mi.Vector2f(self.pndf.alpha**2)) if masked else None

@@ -6,7 +6,8 @@ Smooth filters of a normal map (:monosp:`glint_filtered`)
 
 .. pluginparameters::
 
- * Shared: filename, bitmap, data, map_type, height_scale, wrap_mode, to_uv
+ * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,
+   fill_voids, wrap_mode, to_uv
 
  * - method
    - |string|
@@ -124,7 +125,7 @@ class GlintFiltered(GlintBSDF):
             method=method,
             alpha=parameters.number("alpha", 0.05),
             distribution=parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
-            max_anisotropy=parameters.number("max_anisotropy", 16.0, minimum=1.0),
+            max_anisotropy=parameters.number("max_anisotropy", 16.0),
             owner=self.owner,
         )
         masking = parameters.choice("masking", "smith", ("smith", "none"))

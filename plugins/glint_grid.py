@@ -157,13 +157,13 @@ class GlintGrid(GlintBSDF):
         self.pndf = Grid(
             alpha=parameters.per_axis("alpha", 0.3),
             detail_alpha=parameters.per_axis("detail_alpha", 0.05),
-            density=parameters.number("density", 8.0, minimum=-20.0),
+            density=parameters.number("density", 8.0),
             size_variation=parameters.number("size_variation", 0.3),
             intensity=parameters.number("intensity", 1.0),
             light_spread=parameters.number("light_spread", 0.0),
             colors=colors,
-            max_anisotropy=parameters.number("max_anisotropy", 16.0, minimum=1.0),
-            seed=props.get("seed", 0),
+            max_anisotropy=parameters.number("max_anisotropy", 16.0),
+            seed=parameters.whole("seed", 0),
             owner=self.owner,
         )
         self.derive()

@@ -6,7 +6,8 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
 .. pluginparameters::
 
- * Shared: filename, bitmap, data, map_type, height_scale, wrap_mode, to_uv
+ * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,
+   fill_voids, wrap_mode, to_uv
 
  * - kernel
    - |string|

@@ -21,7 +21,7 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
      are its projected normals, H×W×2; new ones make everything anew.
    - |exposed|
 
- * Shared: map_type, height_scale
+ * Shared: layer, map_type, height_scale, encoding, flip_y, strength, fill_voids
 
  * - wrap_mode
    - |string|
@@ -164,8 +164,8 @@ class GlintMip(GlintBSDF):
         sizes = {"output_size": 4096, "patch_size": 64, "clusters": 32, "seed": 0}
         self.pndf = Mip(
             parameters.normal_map(),
-            **{name: props.get(name, default) for name, default in sizes.items()},
-            overlap=props.get("overlap", None),
+            **{name: parameters.whole(name, default) for name, default in sizes.items()},
+            overlap=parameters.whole("overlap", None),
             lod_scale=parameters.number("lod_scale", 0.5),
             balance=parameters.number("balance", 0.9),
             sigma_r=parameters.number("sigma_r", 0.005),

@@ -1,5 +1,5 @@
 """``python -m glintbsdf``: the command line."""
 
-from glintbsdf.cli.main import main
+from glintbsdf.cli import main
 
 main()

@@ -22,10 +22,9 @@ def parameters(**values) -> Parameters:
 def test_numbers(variant):
     given = parameters(a=2, b=0.5, c=np.float32(3))
     assert [given.number(name, 7.0) for name in "abcd"] == [2.0, 0.5, 3.0, 7.0]
-    assert parameters(a=-2).number("a", 0, minimum=-float("inf")) == -2
-    message = r'glint_test: "a" must be a finite number ≥ 1 \(got 0\)'
+    message = r'glint_test: "a" must be a finite number from 0 to 1000000 \(got -2\)'
     with pytest.raises(ParameterError, match=message):
-        parameters(a=0).number("a", 1.0, minimum=1.0)
+        parameters(a=-2).number("a", 1.0)
 
 
 def test_choices_and_booleans(variant):
@@ -122,7 +121,10 @@ def test_indices_of_refraction(variant):
     assert eta(int_ior="bk7", ext_ior="vacuum") == pytest.approx(1.5046)
     assert eta(int_ior=1.5) == pytest.approx(1.5 / 1.000277)
     assert eta(ext_ior="water") == pytest.approx(1.5046 / 1.333)
-    with pytest.raises(ParameterError, match='"int_ior" must be a number > 0 or one of vacuum, .*'):
+    with pytest.raises(
+        ParameterError,
+        match='"int_ior" must be a finite number from 0.001 to 1000 or one of vacuum, .*',
+    ):
         parameters(int_ior="bk8").fresnel()
 
 

@@ -426,12 +426,12 @@ BAD_SHARED_PARAMETERS = [
 ]
 NEGATIVE, NOT_FINITE = (np.array([[[0.5, value, 0.5]]], np.float32) for value in (-0.1, suite.NAN))
 BAD_OWN_PARAMETERS = [
-    ({"alpha": 0.0}, "alpha_u"),
+    ({"alpha": 0.0}, "alpha"),
     ({"alpha": suite.NAN}, "alpha"),
     ({"alpha": 0.3, "alpha_u": 0.2}, "alpha"),
     ({"alpha_v": -0.1}, "alpha_v"),
     ({"detail_alpha": 0.31}, "detail_alpha_u"),
-    ({"detail_alpha": 0.0}, "detail_alpha_u"),
+    ({"detail_alpha": 0.0}, "detail_alpha"),
     ({"alpha_v": 0.04}, "detail_alpha_v"),
     ({"detail_alpha_v": "fine"}, "detail_alpha_v"),
     ({"density": suite.NAN}, "density"),

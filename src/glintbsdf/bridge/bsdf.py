@@ -14,11 +14,15 @@ import mitsuba as mi
 
 from glintbsdf.bridge.parameters import Parameters
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
+from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Gate, Reach, Recorder, must_wait
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet import frame as microfacet
+
+#: The most that footprint_sigma and pixel_spread may be set to after loading.
+LARGEST = 1e4
 
 
 class FootprintBSDF(mi.BSDF):
@@ -43,10 +47,11 @@ class FootprintBSDF(mi.BSDF):
         self.waits = must_wait(self)
         self.owner, self.name = props.plugin_name(), props.id()
         parameters = Parameters(props)
+        parameters.refuse_unknown()
         self.to_uv = parameters.to_uv()
         self.footprint_sigma = mi.Float(parameters.number("footprint_sigma", 0.5))
         self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
-        self.warned_of_point_footprint = False
+        self.warned_of_point_footprint = self.looked_at_surfaces = False
 
     def build(self, reach: Reach | None = None) -> None:
         """Make what queries within ``reach`` need, or any query; whatever there was, goes.
@@ -72,11 +77,12 @@ class FootprintBSDF(mi.BSDF):
     def parameters_changed(self, keys: list[str] = ()) -> None:
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):
             value = getattr(self, key)
+            # Passes of a rendering take pixel_spread beyond the range of its declaration.
             check(
-                dr.all(dr.isfinite(value) & (value >= 0)),
+                dr.all((value >= 0) & (value <= LARGEST)),
                 self.owner,
                 key,
-                "a finite number ≥ 0",
+                f"a finite number from 0 to {LARGEST:g}",
                 value,
             )
 
@@ -102,6 +108,7 @@ class FootprintBSDF(mi.BSDF):
 
     def footprint(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Footprint:
         """The footprint at ``si`` in the UV space of the map, for a query of the active lanes."""
+        self.look_at_surfaces()
         footprint = Footprint.from_interaction(si, self.footprint_sigma, self.pixel_spread)
         if footprint.is_known_to_be_zero() and not is_literal_zero(self.footprint_sigma):
             self.warn_of_point_footprint()
@@ -110,17 +117,44 @@ class FootprintBSDF(mi.BSDF):
             footprint = footprint.transformed(self.to_uv)
         return footprint if self.watch is None else self.watch(footprint, mi.Bool(active))
 
+    def look_at_surfaces(self) -> None:
+        """Look, once, whether the shapes that this BSDF is on fit its map.
+
+        Raises:
+            ParameterError: a mesh without UV coordinates.
+        """
+        if self.looked_at_surfaces:
+            return
+        self.looked_at_surfaces = True
+        shapes = shapes_of(self)
+        require_uvs(self.owner, shapes)
+        doubt = doubt_of_green(self.normal_map, self.to_uv, shapes)
+        if doubt:
+            mi.Log(mi.LogLevel.Warn, f'{self.owner} "{self.name}": {doubt}')
+
     def warn_of_point_footprint(self) -> None:
-        """Say, once, that nothing tells how large a pixel is."""
-        if not self.warned_of_point_footprint:
-            self.warned_of_point_footprint = True
-            mi.Log(
-                mi.LogLevel.Warn,
-                f'{self.owner} "{self.name}": the integrator gives no footprint and '
-                '"pixel_spread" is 0, so glints are as fine as the map allows, whatever the '
-                'distance. Render with "glintbsdf render" or the integrator "glint_path", or '
-                'set "pixel_spread" to the angle of a pixel in radians.',
-            )
+        """Say, once, that nothing tells how large a pixel is, and why."""
+        if self.warned_of_point_footprint:
+            return
+        self.warned_of_point_footprint = True
+        reason = (
+            'the integrator gives no footprint and "pixel_spread" is 0'
+            if is_literal_zero(self.pixel_spread)
+            else "the surface does not tell how its UV coordinates change along it, as curves do "
+            'not, so that no footprint follows from "pixel_spread"'
+        )
+        remedy = (
+            'Use the integrator "glint_path", with an orthographic camera as well, whose pixels '
+            'have no angle; or set "pixel_spread" to the angle of a pixel in radians, as '
+            '"glintbsdf render" does where the camera has perspective.'
+            if is_literal_zero(self.pixel_spread)
+            else "Use a mesh, or a shape of Mitsuba that has a surface."
+        )
+        mi.Log(
+            mi.LogLevel.Warn,
+            f'{self.owner} "{self.name}": {reason}, so glints are as fine as the map allows, '
+            f"whatever the distance. {remedy}",
+        )
 
     def members(self) -> dict[str, object]:
         """What describes this BSDF in print, by name; None is left out."""

@@ -7,22 +7,181 @@ nested textures and ``mi.Bitmap`` as objects, tensors and other Dr.Jit arrays as
 arrays are refused by Mitsuba itself.
 
 Properties that nobody reads are reported by Mitsuba as errors, so a parameter is read only where it
-has a meaning.
+has a meaning. A name that no parameter of the plugin has is refused here, with the one that it
+resembles.
+
+The type and range of every parameter are declared in :data:`PARAMETERS`, and nowhere else. Ranges
+are such that single precision bears what is computed from their ends. What depends on other
+parameters or on the map is checked where it is known.
 """
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from collections.abc import Mapping
+from difflib import get_close_matches
+from math import isfinite, pi
 from pathlib import Path
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import ParameterError, check, check_choice
-from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
+from glintbsdf.maps.normalmap import ENCODINGS, MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.microfacet.frame import Conductor, Dielectric
 
 MAP_SOURCES = ("filename", "bitmap", "data")
+
+
+class Number(NamedTuple):
+    """A number from ``minimum`` to ``maximum``, both allowed unless ``above`` or ``below``."""
+
+    minimum: float = 0.0
+    maximum: float = 1e6
+    above: bool = False
+    below: bool = False
+    whole: bool = False
+
+    def __str__(self) -> str:
+        kind = "a whole number" if self.whole else "a finite number"
+        if self.above or self.below:
+            low, high = "(" if self.above else "[", ")" if self.below else "]"
+            return f"{kind} in {low}{self.minimum:.10g}, {self.maximum:.10g}{high}"
+        return f"{kind} from {self.minimum:.10g} to {self.maximum:.10g}"
+
+    def holds(self, value: object) -> bool:
+        """Whether ``value`` is a number of the range; a boolean is none."""
+        types = (int,) if self.whole else (int, float)
+        if not isinstance(value, types) or isinstance(value, bool):
+            return False
+        over = value > self.minimum if self.above else value >= self.minimum
+        return over and (value < self.maximum if self.below else value <= self.maximum)
+
+
+class Kind(NamedTuple):
+    """What a parameter other than a number is, in words."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
+NAME = Kind("a name")
+FLAG = Kind("true or false")
+TEXT = Kind("a string")
+BITMAP = Kind("an mi.Bitmap")
+TENSOR = Kind("a tensor")
+TRANSFORM = Kind("a transform")
+SPECTRUM = Kind("a number, colour, spectrum or texture")
+INDEX = Kind("a number or the name of a material")
+COLORS = Kind("a name, an image file or an mi.Bitmap")
+
+#: Indices of refraction, and their imaginary part: Fresnel's equations take their fourth power.
+INDICES = Number(1e-3, 1e3)
+EXTINCTION = Number(0.0, 1e3)
+
+_SEED = Number(0, 2**32 - 1, whole=True)
+_MATERIAL = {
+    "material": NAME,
+    "eta": SPECTRUM,
+    "k": SPECTRUM,
+    "int_ior": INDEX,
+    "ext_ior": INDEX,
+    "specular_reflectance": SPECTRUM,
+}
+_FOOTPRINT = {
+    "to_uv": TRANSFORM,
+    "footprint_sigma": Number(0, 100),
+    "pixel_spread": Number(0, pi),
+}
+_MAP = {
+    "filename": TEXT,
+    "bitmap": BITMAP,
+    "data": TENSOR,
+    "layer": TEXT,
+    "map_type": NAME,
+    "height_scale": Number(-1e9, 1e9),
+    "wrap_mode": NAME,
+    "encoding": NAME,
+    "flip_y": FLAG,
+    "strength": Number(0, 1000),
+    "fill_voids": FLAG,
+}
+_ROUGHNESS = Number(1e-4, 10)
+
+#: The parameters of every plugin, by its type.
+PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
+    "glint_manifold": {
+        **_MAP,
+        **_FOOTPRINT,
+        **_MATERIAL,
+        "kernel": NAME,
+        "epsilon": Number(1e-12, 1, below=True),
+        "threshold": Number(0, 1e3),
+        "max_error": Number(0, 10),
+        "hand_over": Number(0, 1e6),
+        "masking": NAME,
+        "height_correlated": FLAG,
+    },
+    "glint_elements": {
+        **_MAP,
+        **_FOOTPRINT,
+        **_MATERIAL,
+        "sigma_r": Number(1e-8, 1),
+        "step": Number(1 / 16, 1e3),
+        "elements": NAME,
+        "flake_density": Number(1, 1e9),
+        "flake_alpha": Number(0, 10),
+        "seed": _SEED,
+        "masking": NAME,
+    },
+    "glint_mip": {
+        **_MAP,
+        **_FOOTPRINT,
+        **_MATERIAL,
+        "sigma_r": Number(1e-8, 1),
+        "output_size": Number(4, 1 << 16, whole=True),
+        "patch_size": Number(3, 1 << 15, whole=True),
+        "overlap": Number(1, 1 << 14, whole=True),
+        "clusters": Number(1, 1024, whole=True),
+        "lod_scale": Number(0, 16, below=True),
+        "balance": Number(0, 1),
+        "normal_weight": Number(0, 1e6),
+        "seed": _SEED,
+        "masking": NAME,
+    },
+    "glint_filtered": {
+        **_MAP,
+        **_FOOTPRINT,
+        **_MATERIAL,
+        "method": NAME,
+        "alpha": _ROUGHNESS,
+        "distribution": NAME,
+        "max_anisotropy": Number(1, 1024),
+        "masking": NAME,
+        "height_correlated": FLAG,
+    },
+    "glint_diffuse": {**_MAP, **_FOOTPRINT, "reflectance": SPECTRUM, "method": NAME},
+    "glint_grid": {
+        **_FOOTPRINT,
+        **_MATERIAL,
+        **{f"alpha{axis}": _ROUGHNESS for axis in ("", "_u", "_v")},
+        **{f"detail_alpha{axis}": Number(0, 10, above=True) for axis in ("", "_u", "_v")},
+        "density": Number(-20, 20),
+        "size_variation": Number(0, 100),
+        "intensity": Number(0, 1e6),
+        "light_spread": Number(0, pi / 2, below=True),
+        "colors": COLORS,
+        "max_anisotropy": Number(1, 1024),
+        "seed": _SEED,
+    },
+}
+
+
+def declared(owner: str, name: str) -> Number | Kind | None:
+    """The declaration of a parameter, or None where there is none."""
+    return PARAMETERS.get(owner, {}).get(name)
 
 
 class Parameters:
@@ -32,22 +191,39 @@ class Parameters:
         self.props = props
         self.owner = props.plugin_name()
 
+    def refuse_unknown(self) -> None:
+        """Refuse names that no parameter of the plugin has, and name the one that is alike."""
+        known = PARAMETERS.get(self.owner)
+        if known is None:
+            return
+        for name in self.props.keys():
+            if name not in known:
+                alike = get_close_matches(name, known, 1, 0.6)
+                hint = f', did you mean "{alike[0]}"?' if alike else f": it has {', '.join(known)}"
+                raise ParameterError(f'{self.owner}: "{name}" is not a parameter{hint}')
+
     # ----------------------------------------------------------------------------------------------
     #  Simple values
     # ----------------------------------------------------------------------------------------------
 
-    def number(self, name: str, default: float, minimum: float = 0.0) -> float:
-        """A finite number of at least ``minimum``, which may be ``-inf``."""
+    def number(self, name: str, default: float) -> float:
+        """A number of the declared range."""
         value = self.props.get(name, default)
-        requirement = "a finite number" + (f" ≥ {minimum:g}" if isfinite(minimum) else "")
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        check(
-            is_number and isfinite(value) and value >= minimum, self.owner, name, requirement, value
-        )
+        allowed = declared(self.owner, name) or Number()
+        check(allowed.holds(value), self.owner, name, str(allowed), value)
         return float(value)
 
+    def whole(self, name: str, default: int | None) -> int | None:
+        """A whole number of the declared range, or the default, which may be None."""
+        if name not in self.props:
+            return default
+        value = self.props[name]
+        allowed = declared(self.owner, name) or Number(0, 2**32 - 1, whole=True)
+        check(allowed.holds(value), self.owner, name, str(allowed), value)
+        return value
+
     def per_axis(self, name: str, default: float) -> tuple[float, float]:
-        """``name_u`` and ``name_v``, or ``name`` for both: finite numbers ≥ 0."""
+        """``name_u`` and ``name_v``, or ``name`` for both: numbers of the declared range."""
         axes = (f"{name}_u", f"{name}_v")
         self.only_one_of((name,), axes)
         if name in self.props:
@@ -96,13 +272,25 @@ class Parameters:
         value = self.props[source]
         options = {
             "map_type": self.choice("map_type", "auto", MAP_TYPES),
-            "height_scale": self.number("height_scale", 1.0, minimum=-inf),
+            "height_scale": self.number("height_scale", 1.0),
             "wrap_mode": self.choice("wrap_mode", "repeat", WRAP_MODES),
+            "encoding": self.choice("encoding", "auto", ENCODINGS),
+            "strength": self.number("strength", 1.0),
+            "fill_voids": self.boolean("fill_voids", False),
+            "flip_y": self.boolean("flip_y", False),
             "owner": self.owner,
         }
+        normal_map = self._read_map(source, value, options)
+        normal_map.green_is_given = "flip_y" in self.props
+        return normal_map
+
+    def _read_map(self, source: str, value: object, options: dict) -> NormalMap:
         if source == "filename":
             check(isinstance(value, str), self.owner, source, "a string", value)
-            return NormalMap.load(Path(str(mi.file_resolver().resolve(value))), **options)
+            layer = self.props.get("layer", "")
+            check(isinstance(layer, str), self.owner, "layer", "a string", layer)
+            path = Path(str(mi.file_resolver().resolve(value)))
+            return NormalMap.load(path, layer=layer, **options)
         if source == "bitmap":
             check(isinstance(value, mi.Bitmap), self.owner, source, "an mi.Bitmap", value)
             return NormalMap.from_bitmap(value, **options)
@@ -194,8 +382,10 @@ class Parameters:
         if "int_ior" in props or "ext_ior" in props:
             return Dielectric(self.ior("int_ior", "bk7") / self.ior("ext_ior", "air"))
         if "eta" in props or "k" in props:
-            return Conductor(self.spectrum("eta", 0.0), self.spectrum("k", 1.0))
+            most = EXTINCTION.maximum
+            return Conductor(self.spectrum("eta", 0.0, most), self.spectrum("k", 1.0, most))
         material = props.get("material", "none")
+        check(isinstance(material, str), self.owner, "material", "a string", material)
         if material != "none":
             return Conductor(*self.conductor_preset(material))
         if mi.is_polarized:
@@ -206,9 +396,9 @@ class Parameters:
         """The tint, in [0, 1], or None where none is given, which needs no code."""
         if "specular_reflectance" not in self.props:
             return None
-        return self.spectrum("specular_reflectance", 1.0, maximum=1.0)
+        return self.spectrum("specular_reflectance", 1.0, 1.0)
 
-    def spectrum(self, name: str, default: float, maximum: float = inf) -> mi.Texture:
+    def spectrum(self, name: str, default: float, maximum: float) -> mi.Texture:
         """A number, colour, spectrum or texture with values from 0 to ``maximum``, as a texture.
 
         Only what is given as numbers is checked here: a texture has checked itself.
@@ -221,27 +411,21 @@ class Parameters:
             mi.Properties.Type.Spectrum: lambda: list(value.values),
         }
         kind = self.props.type(name) if name in self.props else mi.Properties.Type.Float
-        is_texture = isinstance(value, mi.Texture)
-        requirement = "a number, colour, spectrum or texture of finite values ≥ 0" + (
-            f" and ≤ {maximum:g}" if isfinite(maximum) else ""
-        )
         check(
-            is_texture
-            or (
-                kind in numeric and all(isfinite(x) and 0 <= x <= maximum for x in numeric[kind]())
-            ),
+            isinstance(value, mi.Texture)
+            or (kind in numeric and all(0 <= x <= maximum for x in numeric[kind]())),
             self.owner,
             name,
-            requirement,
+            f"a number, colour, spectrum or texture of values from 0 to {maximum:g}",
             value,
         )
         # Mitsuba bounds the colours of get_texture by 1: fit for a reflectance, not for an index.
-        if isfinite(maximum):
+        if maximum <= 1:
             return self.props.get_texture(name, default)
         return self.props.get_unbounded_texture(name, default)
 
     def ior(self, name: str, default: str) -> float:
-        """An index of refraction: a number > 0 or the name of one of Mitsuba's presets."""
+        """An index of refraction: a number or the name of one of Mitsuba's presets."""
         value = self.props.get(name, default)
         if isinstance(value, str):
             named = mi.Properties()
@@ -251,16 +435,15 @@ class Parameters:
             except RuntimeError as error:
                 choices = str(error).partition("Valid choices are:")[2].strip()
                 raise ParameterError(
-                    f'{self.owner}: "{name}" must be a number > 0 or one of '
-                    f'{choices} (got "{value}")'
+                    f'{self.owner}: "{name}" must be {INDICES} or one of '
+                    f'{" ".join(choices.split())} (got "{value}")'
                 ) from None
-        number = self.number(name, 0.0)
-        check(number > 0, self.owner, name, "a number > 0 or the name of a material", value)
-        return number
+        requirement = f"{INDICES} or the name of a material"
+        check(INDICES.holds(value), self.owner, name, requirement, value)
+        return float(value)
 
     def conductor_preset(self, material: str) -> tuple[mi.Texture, mi.Texture]:
         """The textures eta and k of one of Mitsuba's metals, from its ``conductor`` plugin."""
-        check(isinstance(material, str), self.owner, "material", "a string", material)
 
         class Collect(mi.TraversalCallback):
             def put(self, name: str, value: object, flags: int) -> None:

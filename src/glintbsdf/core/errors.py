@@ -9,9 +9,15 @@ class ParameterError(ValueError):
     """A parameter of a plugin or function has a value that is not allowed."""
 
 
+LONGEST = 200  # characters of a value that an error quotes
+
+
 def describe(value: object) -> str:
-    """Show a value as an error quotes it: strings in double quotes, everything else by repr."""
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    """Show a value as an error quotes it: in one line, strings in double quotes, else by repr."""
+    text = " ".join(str(value).split() if isinstance(value, str) else repr(value).split())
+    if len(text) > LONGEST:
+        text = text[: LONGEST - 1] + "…"
+    return f'"{text}"' if isinstance(value, str) else text
 
 
 def check(condition: bool, owner: str, parameter: str, requirement: str, got: object) -> None:
@@ -26,7 +32,13 @@ def check(condition: bool, owner: str, parameter: str, requirement: str, got: ob
 
 def check_choice(owner: str, parameter: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise :class:`ParameterError` unless ``value`` is one of ``choices``."""
-    check(value in choices, owner, parameter, "one of " + ", ".join(choices), value)
+    check(
+        isinstance(value, str) and value in choices,
+        owner,
+        parameter,
+        "one of " + ", ".join(choices),
+        value,
+    )
 
 
 def check_whole(

@@ -50,35 +50,14 @@ def pixel_angle(sensor: mi.Sensor) -> float:
     return float(np.asarray(dr.sqrt(dr.sqrt(squared))).item())
 
 
-def require_uvs(scene: mi.Scene) -> None:
-    """Refuse a scene with a glint BSDF on a mesh without UV coordinates.
-
-    Mitsuba gives such a mesh the barycentric coordinates of each triangle in their place, so that
-    every triangle would show the whole map.
-
-    Raises:
-        ValueError: names the mesh and says what to do.
-    """
-    for shape in scene.shapes():
-        if not shape.is_mesh() or shape.has_vertex_texcoords():
-            continue
-        if any(key.endswith("pixel_spread") for key in mi.traverse(shape).keys()):
-            raise ValueError(
-                f'the mesh "{shape.id()}" has no UV coordinates, by which its glint BSDF finds its '
-                "place in the map: export the mesh with UVs (PLY: s, t or u, v; OBJ: vt), or use a "
-                "shape of Mitsuba that has them"
-            )
-
-
 def first_sensor(scene: mi.Scene) -> mi.Sensor:
     """The sensor that a scene is rendered with.
 
     Raises:
-        ValueError: no sensor, or a mesh without the UVs that its BSDF needs.
+        ValueError: no sensor.
     """
     if not scene.sensors():
         raise ValueError("the scene has no sensor")
-    require_uvs(scene)
     return scene.sensors()[0]
 
 
