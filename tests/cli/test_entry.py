@@ -203,6 +203,28 @@ def test_a_failed_rendering_keeps_the_former_image(run, folder, monkeypatch):
     assert set(folder.iterdir()) == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_a_full_disk_is_told(folder, variant, name):
+    """Mitsuba writes what fits, or nothing, and does not tell."""
+    before = set(folder.iterdir())
+    code = (
+        "import resource as r, sys; from glintbsdf.cli import entry; from glintbsdf.scene import "
+        "rendering; save = rendering.save\n"
+        "def full(*args):\n"
+        "    r.setrlimit(r.RLIMIT_FSIZE, (40, r.getrlimit(r.RLIMIT_FSIZE)[1])); save(*args)\n"
+        "rendering.save = full; entry.main()"
+    )
+    command = ["render", "scene.xml", "-m", variant, "-o", name, "--spp", "1"]
+    result = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True)
+    assert result.returncode == 1 and result.stdout == ""
+    reason = (
+        "I/O error" if name.endswith("exr") else "what has arrived on the disk is not the whole"
+    )
+    assert f"Error: cannot write {name}: {reason}" in result.stderr
+    assert set(folder.iterdir()) == before
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
 def test_interruption_leaves_nothing(folder, variant):
     before = set(folder.iterdir())

@@ -177,6 +177,21 @@ def test_old_files_go(folder, monkeypatch):
     assert all(file.exists() for file in foreign)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
+def test_a_full_disk_stays_as_it_was(folder):
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with pytest.warns(UserWarning, match="builds without its cache"):
+            arrays = cache.load_or_build("large", lambda: {"a": np.ones(100_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert arrays["a"].sum() == 100_000
+    assert not list(folder.iterdir())
+
+
 def hammer(seed):
     """Write and read one key over and over; any mixture of two files would show."""
     for _ in range(30):

@@ -1,4 +1,4 @@
-"""The progress bar appears for slow work on a terminal, and never else."""
+"""Slow work shows: by a bar on a terminal, by lines in a log."""
 
 from __future__ import annotations
 
@@ -36,3 +36,26 @@ def test_errors_pass_through(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with pytest.raises(RuntimeError, match="no"), progress("Building"):
         raise RuntimeError("no")
+
+
+def test_lines_in_a_log(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(module, "_FIRST_LINE", 0.1)
+    with progress("Rendering") as report:
+        time.sleep(0.15)
+        report(0.5)
+        time.sleep(0.1)
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "Rendering: 0 s so far"
+    assert lines[1].startswith("Rendering: 50 % after 0 s, about 0 s left")
+    assert lines[-1] == "Rendering: done in 0 s" and len(lines) == 3
+
+
+def test_durations():
+    assert [module.duration(s) for s in (0.4, 59, 200, 7500)] == [
+        "0 s",
+        "59 s",
+        "3 min 20 s",
+        "2 h 05 min",
+    ]

@@ -84,7 +84,8 @@ def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 file.close()
                 os.replace(file.name, path)
             except BaseException:
-                file.close()
+                with contextlib.suppress(OSError):  # a full disk fails here once more
+                    file.close()
                 os.unlink(file.name)
                 raise
         _tidy(path.parent)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -169,10 +170,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary file beside ``path`` that takes its place when the block succeeds.
 
     The file is made at once, so that a place that cannot be written shows before the work is done.
-    Whatever ends the block otherwise, ``path`` stays as it was and nothing else is left.
+    What has been written is brought to the disk and read back, as Mitsuba does not tell of a disk
+    that is full. Whatever ends the block otherwise, ``path`` stays as it was and nothing else is
+    left.
 
     Raises:
-        OSError: the folder does not exist or cannot be written, or ``path`` is a folder.
+        OSError: the folder does not exist or cannot be written, or ``path`` is a folder; or the
+            file is not whole.
     """
     path = Path(path)
     if path.is_dir():
@@ -187,10 +191,44 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
+        _require_whole(temporary, path)
         # mkstemp makes private files; the image gets the permissions of any new file.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
+    except RuntimeError as error:  # of a writer, which knows the temporary name only
+        if str(temporary) in str(error):
+            reason = str(error).rpartition(f'{temporary}"')[2].strip(": ")
+            raise OSError(f"cannot write {path}: {reason}") from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _require_whole(written: Path, path: Path) -> None:
+    """Raise OSError unless an image file has arrived on the disk as a whole.
+
+    OpenEXR's reader finds a missing part as well as a damaged one, Mitsuba's that of a PNG.
+    """
+    reason = "it is empty"
+    try:
+        with written.open("rb+") as file:
+            os.fsync(file.fileno())
+        if written.stat().st_size:
+            if written.suffix.lower() == ".exr":
+                import OpenEXR
+
+                with OpenEXR.File(str(written), separate_channels=True) as image:
+                    whole = all(len(channel.pixels) for channel in image.channels().values())
+            else:
+                whole = np.asarray(mi.Bitmap(str(written))).size > 0
+            if whole:
+                return
+    except Exception as error:  # of a library, or of the system: the file is not whole
+        reason = " ".join(str(error).split())
+    free = shutil.disk_usage(written.parent).free
+    raise OSError(
+        f"cannot write {path}: what has arrived on the disk is not the whole image ({reason}); "
+        f"{free / 1e6:.0f} MB are free there"
+    )
