@@ -17,7 +17,7 @@ import pytest
 
 from glintbsdf import NormalMap, maps
 from glintbsdf.cli import entry as cli
-from glintbsdf.scene import rendering
+from glintbsdf.scene import rendering, units
 
 SCENE = """<scene version="3.0.0">
     <default name="size" value="16"/>
@@ -283,38 +283,23 @@ def test_pixel_angle_of_a_parallel_projection_is_zero(variant):
     assert rendering.pixel_angle(mi.load_dict({"type": "orthographic"})) == 0
 
 
-@pytest.mark.parametrize("passes", [1, 4])
 @pytest.mark.parametrize("own_spread", [0.0, 0.01])
-def test_passes_have_the_footprint_of_the_whole_image(folder, variant, passes, own_spread):
-    """What a BSDF sees is σ times the spread of a pass, and σ times the differentials of a pass."""
+def test_bsdfs_get_the_footprint_of_the_whole_image(folder, variant, own_spread):
     scene = rendering.load_scene("scene.xml", {"spread": str(own_spread)})
     sensor = scene.sensors()[0]
     before = footprint_parameters(scene)
-    with rendering.footprints(scene, sensor, 16, passes):
+    with rendering.footprints(scene, sensor, 16):
         spread, sigma = footprint_parameters(scene)
     assert footprint_parameters(scene) == before
-    whole = own_spread or rendering.pixel_angle(sensor) / np.sqrt(16)
-    assert spread * sigma == pytest.approx(0.5 * whole, rel=1e-5)
-    assert sigma / np.sqrt(16 / passes) == pytest.approx(0.5 / np.sqrt(16), rel=1e-5)
-
-
-@pytest.mark.parametrize("spp, pixels, count", [
-    (16, 100, 1),  # a small image is rendered at once
-    (16, 1 << 18, 16),  # at most one pass per sample
-    (64, 1 << 14, 4),
-    (12, 1 << 17, 6),  # passes of equal size only
-    (13, 1 << 16, 1),
-    (1, 1 << 24, 1),
-])  # fmt: skip
-def test_pass_count(spp, pixels, count):
-    assert rendering._pass_count(spp, pixels) == count
+    assert sigma == 0.5
+    assert spread == pytest.approx(own_spread or rendering.pixel_angle(sensor) / 4, rel=1e-5)
 
 
 def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
     """The same light in one pass and in eight, within the noise of both."""
     images = {}
     for size in (1 << 18, 512):
-        monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", size)
+        monkeypatch.setattr(units, "FEWEST", size)
         fractions = []
         scene = rendering.load_scene("scene.xml")
         bitmap = rendering.render(scene, 16, 0, fractions.append)
@@ -330,7 +315,7 @@ def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
 
 
 def test_stratified_samplers_render_in_one_pass(folder, variant, monkeypatch):
-    monkeypatch.setattr(rendering, "_SAMPLES_PER_PASS", 256)
+    monkeypatch.setattr(units, "FEWEST", 256)
     fractions = []
     scene = rendering.load_scene("scene.xml", {"sampler": "multijitter"})
     rendering.render(scene, report=fractions.append)

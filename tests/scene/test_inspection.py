@@ -64,8 +64,9 @@ def load(**parameters) -> inspection.Inspected:
     return inspection.load("scene.xml", {key: str(value) for key, value in parameters.items()})
 
 
-def image(inspected: inspection.Inspected, check=lambda: None) -> mi.Bitmap:
-    return rendering.render(inspected.scene, report=lambda done: check())
+def image(inspected: inspection.Inspected, missed=lambda: False) -> np.ndarray:
+    with rendering.Renderer(inspected.scene, missed=missed) as renderer:
+        return np.array(rendering.produce(renderer).bitmap)
 
 
 def test_survey_finds_what_the_sensor_sees(folder):
@@ -110,17 +111,18 @@ def test_survey_leaves_the_scene_as_it_was(folder):
 def test_trimmed_rendering_is_the_same(folder, plugin, path):
     parameters = {"plugin": plugin, "integrator": path[0], "depth": path[1]}
     inspected = load(**parameters)
-    trimmed, sufficed = inspection.render_trimmed(inspected, lambda check: image(inspected, check))
+    trimmed = inspection.Trimmed(inspected)
+    picture = image(inspected, trimmed.missed)
     kept = sum(inspected.bsdfs[0].parts().values())
     complete = inspection.Inspected(
         rendering.load_scene("scene.xml", {key: str(value) for key, value in parameters.items()}),
         [],
     )
-    assert np.array_equal(np.array(trimmed), np.array(image(complete)))
+    assert np.array_equal(picture, image(complete))
     inspection.build(inspected)
     whole = sum(inspected.bsdfs[0].parts().values())
     if path[0] == "path":
-        assert sufficed
+        assert trimmed.sufficed
         assert kept < whole or plugin == "glint_diffuse"  # whose vertices are all it has
 
 
@@ -135,24 +137,25 @@ def test_a_survey_that_missed_something_costs_time_only(folder, monkeypatch, par
     monkeypatch.setattr(inspection, "survey", short_sighted)
     monkeypatch.setattr("glintbsdf.footprint.domain.MARGIN_TEXELS", 0)
     inspected = load()
+    trimmed = inspection.Trimmed(inspected)
     begun = []
 
-    def render(check) -> mi.Bitmap:
+    def missed() -> bool:
         begun.append(1)
-        return image(inspected, check)
+        return trimmed.missed()
 
-    trimmed, sufficed = inspection.render_trimmed(inspected, render)
-    assert not sufficed and len(begun) == 2
-    inspection.build(inspected)
-    assert np.array_equal(np.array(trimmed), np.array(image(inspected)))
+    picture = image(inspected, missed)
+    assert not trimmed.sufficed and len(begun) == 2
+    assert np.array_equal(picture, image(inspected))
 
 
 def test_what_no_path_meets_is_not_built(folder):
     text = SCENE.replace('origin="0,0,4" target="0,0,0"', 'origin="0,0,4" target="0,0,9"')
     (folder / "scene.xml").write_text(text)
     inspected = load()
-    trimmed, sufficed = inspection.render_trimmed(inspected, lambda check: image(inspected, check))
-    assert sufficed and inspected.bsdfs[0].parts() == {} and np.ptp(np.array(trimmed)) == 0
+    trimmed = inspection.Trimmed(inspected)
+    picture = image(inspected, trimmed.missed)
+    assert trimmed.sufficed and inspected.bsdfs[0].parts() == {} and np.ptp(picture) == 0
     (finding,) = inspection.inspect(load())
     assert finding.reach is None and finding.trimmed == {} and finding.complete
     assert "no path meets it" in str(finding) and "next to nothing" in str(finding)

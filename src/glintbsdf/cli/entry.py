@@ -215,33 +215,25 @@ def render(
     _activate(variant)
     path = output or scene.with_suffix(".exr")
     with rendering.replacing(path) as unfinished:
+        trimmed = None
+        # Plugins show the progress of what they build while the scene loads.
         if trim:
-            bitmap = _render_trimmed(scene, definitions, spp, seed, denoise)
+            inspected = inspection.load(scene, definitions)
+            loaded, trimmed = inspected.scene, inspection.Trimmed(inspected, spp)
         else:
-            # Plugins show the progress of what they build while the scene loads.
             loaded = rendering.load_scene(scene, definitions)
-            with progress("Rendering") as report:
-                bitmap = rendering.render(loaded, spp, seed, report, denoise)
-        rendering.save(bitmap, unfinished)
-    click.echo(path)
-
-
-def _render_trimmed(
-    scene: Path, definitions: dict[str, str], spp: int | None, seed: int, denoise: bool
-) -> mi.Bitmap:
-    """Render by structures that a survey has trimmed, and tell where they have not sufficed."""
-    inspected = inspection.load(scene, definitions)
-
-    def render(check) -> mi.Bitmap:
-        with progress("Rendering") as report:
-            return rendering.render(
-                inspected.scene, spp, seed, lambda done: (check(), report(done)), denoise
+        missed = trimmed.missed if trimmed else lambda: False
+        with (
+            rendering.Renderer(loaded, spp, denoise, missed) as renderer,
+            progress("Rendering") as report,
+        ):
+            picture = rendering.produce(
+                renderer, seed, observe=lambda image: report(image.fraction)
             )
-
-    bitmap, sufficed = inspection.render_trimmed(inspected, render, spp)
-    if not sufficed:
-        click.echo("Trimmed structures did not suffice: built in full, rendered again.", err=True)
-    return bitmap
+        if trimmed and not trimmed.sufficed:
+            click.echo("Trimmed structures did not suffice: built in full.", err=True)
+        rendering.save(picture.bitmap, unfinished)
+    click.echo(path)
 
 
 @commands.command()

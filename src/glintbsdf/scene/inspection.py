@@ -4,22 +4,21 @@ A survey renders the scene with few samples and notes the part of each map and t
 its BSDF is asked for, along whole paths, by the scene's own sensor and integrator. The BSDFs are
 then built for these, and a margin (``reach.py``). Within them a trimmed BSDF answers as a complete
 one, to the last bit; that nothing else has been asked for is checked after every pass of the
-rendering. If something has, all is built in full, and the rendering begins again: the image is the
+rendering. If something has, all is built in full, and the pass is rendered again: the image is the
 same in any case.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 
 from glintbsdf.footprint.domain import NOTHING, Gate, Reach, Recorder, waiting
 from glintbsdf.maps.normalmap import NormalMap
-from glintbsdf.scene import rendering
+from glintbsdf.scene import passes, rendering
 
 #: Paths of a survey, about: a second's work of two CPU cores.
 PATHS = 1 << 18
@@ -28,10 +27,6 @@ SEED = 0x5EED
 
 #: Memory that a report mentions, bytes.
 NOTABLE = 1e5
-
-
-class Missed(Exception):
-    """A trimmed BSDF has been asked for what it has not built."""
 
 
 @dataclass
@@ -60,28 +55,24 @@ def survey(inspected: Inspected, spp: int | None = None) -> list[Reach | None]:
     """
     scene = inspected.scene
     sensor = rendering.first_sensor(scene)
-    sampler = sensor.sampler()
-    own = sampler.sample_count()
-
-    def rounded(count: int) -> int:  # as the sampler requires it
-        sampler.set_sample_count(count)
-        return sampler.sample_count()
-
-    spp = rounded(spp or own)
-    pixels = int(np.prod(sensor.film().crop_size()))
-    few = rounded(min(spp, max(1, PATHS // pixels)))
+    sampler = sensor.sampler().clone()
+    if spp is not None:
+        sampler.set_sample_count(spp)
+    spp = int(sampler.sample_count())
+    film = passes.whole(sensor.film())
+    wanted = min(spp, max(1, PATHS // film.pixels))
+    few = max(count for count in range(1, wanted + 1) if spp % count == 0)
     maps = [map_of(bsdf) for bsdf in inspected.bsdfs]
     recorders = [normal_map and Recorder(normal_map) for normal_map in maps]
     for bsdf, recorder in zip(inspected.bsdfs, recorders, strict=True):
         bsdf.watch = recorder
     try:
-        with rendering.footprints(scene, sensor, spp, spp / few):
-            scene.integrator().render(scene, sensor, seed=SEED, spp=few)
+        with rendering.footprints(scene, sensor, spp):
+            passes.sums_of_samples(scene, sensor, scene.integrator(), film, few, spp, SEED)
         return [recorder and recorder.found() for recorder in recorders]
     finally:
         for bsdf in inspected.bsdfs:
             bsdf.watch = None
-        sampler.set_sample_count(own)
 
 
 def map_of(bsdf: object) -> NormalMap | None:
@@ -116,36 +107,34 @@ def build_trimmed(inspected: Inspected, reaches: list[Reach | None]) -> None:
             bsdf.build(reach.widened())
 
 
-def render_trimmed(
-    inspected: Inspected,
-    render: Callable[[Callable[[], None]], mi.Bitmap],
-    spp: int | None = None,
-) -> tuple[mi.Bitmap, bool]:
-    """Render with BSDFs that hold no more than the scene asks for.
+class Trimmed:
+    """Glint BSDFs that hold no more than the scene asks for, and all as soon as that is too little.
+
+    Its :meth:`missed` is for :class:`~glintbsdf.scene.rendering.Renderer`: what trimmed BSDFs have
+    answered within their reach stays, as it is the same to the last bit.
 
     Args:
         inspected: from :func:`load`.
-        render: function that renders ``inspected.scene``, in passes perhaps, and calls the function
-            it is given after each.
-        spp: samples per pixel of ``render``, None for the scene's.
+        spp: samples per pixel of the rendering, None for the scene's.
 
-    Returns:
-        The image, and whether trimmed BSDFs have sufficed. Where they have not, all is built in
-        full and rendered once more.
+    Attributes:
+        sufficed (bool): nothing else has been asked for so far.
     """
 
-    trimmed = able_to_wait(inspected)
+    def __init__(self, inspected: Inspected, spp: int | None = None) -> None:
+        self.inspected = inspected
+        self.sufficed = True
+        build_trimmed(inspected, survey(inspected, spp))
 
-    def check() -> None:
-        if any(bsdf.watch.missed() for bsdf in trimmed):
-            raise Missed
-
-    build_trimmed(inspected, survey(inspected, spp))
-    try:
-        return render(check), True
-    except Missed:
-        build(inspected)
-        return render(lambda: None), False
+    def missed(self) -> bool:
+        """Whether anything else has been asked for since the last call; then all is built now."""
+        if not self.sufficed or not any(
+            bsdf.watch.missed() for bsdf in able_to_wait(self.inspected)
+        ):
+            return False
+        self.sufficed = False
+        build(self.inspected)
+        return True
 
 
 # ------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Render a scene file to an image file: footprints from the sensor, passes, whole files only."""
+"""Render a scene file to an image file: footprints from the sensor, units, whole files only."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.scene import passes
 from glintbsdf.scene.denoising import denoised, guided
+from glintbsdf.scene.merging import Image, Results, merge
+from glintbsdf.scene.passes import Tile
+from glintbsdf.scene.storage import Checkpoint
+from glintbsdf.scene.units import Plan, Unit
 
 FORMATS = (".exr", ".png")
-
-# A pass of this many samples keeps two CPU cores busy for about a second, and a GPU busy.
-_SAMPLES_PER_PASS = 1 << 18
 
 
 # ---------------------------------------------------------------------------------------------
@@ -63,23 +66,19 @@ def first_sensor(scene: mi.Scene) -> mi.Sensor:
 
 
 @contextmanager
-def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: float = 1) -> Iterator[None]:
-    """Give all glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel, in the block.
+def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
+    """Give the glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel, in the block.
 
     A BSDF whose ``pixel_spread`` is 0 gets the sensor's pixel angle, scaled by 1/√spp as Mitsuba
-    scales ray differentials. Where the image is the mean of ``passes`` renderings, Mitsuba scales
-    by the samples of one pass only. The rest, 1/√passes, goes into ``footprint_sigma``, and is
-    taken out of the ``pixel_spread`` that a scene has set itself.
+    scales ray differentials. ``spp`` counts the samples of the whole image; integrators are told
+    the same number, whatever passes the image is made in (:mod:`glintbsdf.scene.passes`).
     """
     parameters = mi.traverse(scene)
-    parameters.keep([r".*(pixel_spread|footprint_sigma)$"])
+    parameters.keep([r".*pixel_spread$"])
     original = {key: mi.Float(parameters[key]) for key in parameters.keys()}
-    spread = pixel_angle(sensor) / (spp / passes) ** 0.5
+    spread = pixel_angle(sensor) / spp**0.5
     for key, own in original.items():
-        if key.endswith("pixel_spread"):
-            parameters[key] = dr.select(own > 0, own * passes**0.5, spread)
-        else:
-            parameters[key] = own / passes**0.5
+        parameters[key] = dr.select(own > 0, own, spread)
     parameters.update()
     try:
         yield
@@ -94,6 +93,143 @@ def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int, passes: float = 1) 
 # ---------------------------------------------------------------------------------------------
 
 
+class Renderer:
+    """A loaded scene, ready to render units of an image; a context manager.
+
+    Args:
+        scene: with its BSDFs built, or trimmed.
+        spp: samples per pixel of the whole image, None for what the scene says. Mitsuba rounds it
+            up where the sampler requires it.
+        denoise: the image will be denoised, see :mod:`glintbsdf.scene.denoising`.
+        missed: called after each unit; whether the unit has asked for something that was not there,
+            and is there now, so that the unit must be rendered again.
+
+    Raises:
+        ValueError: no sensor, or a mesh without the UVs that its BSDF needs; or ``denoise`` with
+            an integrator other than ``glint_path``.
+        ModuleNotFoundError: ``denoise``, and no denoiser is installed.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        spp: int | None = None,
+        denoise: bool = False,
+        missed: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.scene, self.sensor = scene, first_sensor(scene)
+        self.integrator = scene.integrator()
+        self.denoise, self.missed = denoise, missed
+        sampler = self.sensor.sampler().clone()
+        if spp is not None:
+            sampler.set_sample_count(spp)
+        self.spp = int(sampler.sample_count())
+        self.stratified = sampler.class_name() != "IndependentSampler"
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Renderer:
+        if self.denoise:
+            self.integrator = self._stack.enter_context(guided(self.integrator))
+        self._stack.enter_context(footprints(self.scene, self.sensor, self.spp))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def plan(self, seed: int) -> Plan:
+        """How the image of a seed is divided."""
+        divisible = isinstance(self.integrator, mi.SamplingIntegrator)
+        film = passes.whole(self.sensor.film())
+        return Plan(film, self.spp, seed, self.stratified, divisible)
+
+    def render(self, unit: Unit) -> tuple[Tile, np.ndarray]:
+        """The pixels that the samples of a unit reach, and their sums.
+
+        See :func:`~glintbsdf.scene.passes.sums_of_samples`.
+        """
+        while True:
+            result = passes.sums_of_samples(
+                self.scene, self.sensor, self.integrator, unit.tile, unit.spp, self.spp, unit.seed
+            )
+            if not self.missed():
+                return result
+
+    def render_all(self, units: Iterator[Unit]) -> Results:
+        """Render units one after the other, in this process."""
+        for unit in units:
+            yield unit, *self.render(unit)
+
+    def developed(self, sums: np.ndarray) -> mi.Bitmap:
+        """The image of the sums (height, width, channels) of all its pixels."""
+        bitmap = passes.developed(self.sensor.film(), self.integrator.aov_names(), sums)
+        return denoised(bitmap) if self.denoise else bitmap
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image, or as much of it as is done.
+
+    Attributes:
+        bitmap (mi.Bitmap): what is done.
+        fraction (float): of the samples that are in, in (0, 1].
+        noise (float | None): see :attr:`.Image.noise`.
+    """
+
+    bitmap: mi.Bitmap
+    fraction: float
+    noise: float | None
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, when a part of an image was done: ``picture``."""
+
+    def __init__(self, picture: Picture) -> None:
+        super().__init__()
+        self.picture = picture
+
+
+def produce(
+    renderer: Renderer,
+    seed: int = 0,
+    render_all: Callable[[Iterator[Unit]], Results] | None = None,
+    checkpoint: Checkpoint | None = None,
+    until_noise: float | None = None,
+    time_limit: float | None = None,
+    observe: Callable[[Image], None] = lambda image: None,
+) -> Picture:
+    """Render the image of a seed.
+
+    Args:
+        renderer: entered; what plans and develops the image.
+        render_all: renders the units; None for ``renderer`` itself. See :func:`.merge` for this
+            and the rest.
+
+    Raises:
+        Interrupted: by Ctrl-C, when a part of the image was done.
+        KeyboardInterrupt: by Ctrl-C, before.
+    """
+    image = Image(renderer.plan(seed), renderer.sensor.film().base_channels_count() + 1)
+    try:
+        merge(
+            image,
+            render_all or renderer.render_all,
+            checkpoint,
+            until_noise,
+            time_limit,
+            observe,
+        )
+    except KeyboardInterrupt as interrupt:
+        if image.sums is None:
+            raise
+        raise Interrupted(picture(renderer, image)) from interrupt
+    return picture(renderer, image)
+
+
+def picture(renderer: Renderer, image: Image) -> Picture:
+    """What is done of an image."""
+    return Picture(renderer.developed(image.sums), image.fraction, image.noise)
+
+
 def render(
     scene: mi.Scene,
     spp: int | None = None,
@@ -103,9 +239,9 @@ def render(
 ) -> mi.Bitmap:
     """Render the first sensor of ``scene`` and return its developed film.
 
-    The image is the mean of several passes with seeds derived from ``seed``, and ``report`` is
-    called with the fraction done after each. A sampler that stratifies the samples of a pixel would
-    lose by that and renders in one pass. BSDFs see the pixels' footprints, see :func:`footprints`.
+    The image is made in units, see :mod:`glintbsdf.scene.units`, and ``report`` is called with the
+    fraction done after each. It is the same to the last bit whenever it is rendered. BSDFs see the
+    pixels' footprints, see :func:`footprints`.
 
     Args:
         spp: samples per pixel; None for what the scene says. Mitsuba rounds it up where the
@@ -113,42 +249,12 @@ def render(
         denoise: filter indirect light, see :mod:`glintbsdf.scene.denoising`.
 
     Raises:
-        ValueError: no sensor, or a mesh without the UVs that its BSDF needs; or ``denoise`` with
-            an integrator other than ``glint_path``.
-        ModuleNotFoundError: ``denoise``, and no denoiser is installed.
-        KeyboardInterrupt: also where Mitsuba itself has caught the signal.
+        ValueError, ModuleNotFoundError: see :class:`Renderer`.
+        Interrupted: by Ctrl-C; it has what is done.
     """
-    sensor = first_sensor(scene)
-    sampler = sensor.sampler()
-    if spp is not None:
-        sampler.set_sample_count(spp)
-    spp = sampler.sample_count()
-    passes = 1
-    if sampler.class_name() == "IndependentSampler":
-        passes = _pass_count(spp, int(np.prod(sensor.film().crop_size())))
-
-    total: np.ndarray | float = 0.0
-    integrators = guided(scene.integrator()) if denoise else nullcontext(scene.integrator())
-    with footprints(scene, sensor, spp, passes), integrators as integrator:
-        for index in range(passes):
-            # Seeds of neighbouring images must not share passes.
-            pass_seed = mi.sample_tea_32(seed, index)[0] if passes > 1 else seed
-            integrator.render(scene, sensor, seed=pass_seed, spp=spp // passes)
-            if integrator.should_stop():
-                # Mitsuba caught Ctrl-C during the pass, and Python was not told.
-                raise KeyboardInterrupt
-            bitmap = sensor.film().bitmap()
-            total = total + np.array(bitmap, dtype=np.float64)
-            report((index + 1) / passes)
-    sampler.set_sample_count(spp)  # which the last pass has left at its own
-    np.asarray(bitmap)[...] = total / passes
-    return denoised(bitmap) if denoise else bitmap
-
-
-def _pass_count(spp: int, pixels: int) -> int:
-    """The divisor of ``spp`` whose passes come nearest to, and not below, a sensible size."""
-    wanted = max(1, spp * pixels // _SAMPLES_PER_PASS)
-    return max(count for count in range(1, min(spp, wanted) + 1) if spp % count == 0)
+    with Renderer(scene, spp, denoise) as renderer:
+        done = produce(renderer, seed, observe=lambda image: report(image.fraction))
+    return done.bitmap
 
 
 # ---------------------------------------------------------------------------------------------

@@ -1,0 +1,216 @@
+"""What is done, on disk: files of units and of merged images, and checkpoints made of them.
+
+Every file carries a digest of its content, and is there whole or not at all: it is written beside
+its place, brought to the disk, and moved there. A file that a disk has damaged all the same is
+noticed when it is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from glintbsdf.scene.passes import Tile
+
+if TYPE_CHECKING:
+    from glintbsdf.scene.merging import Image
+
+#: Of the files of a checkpoint; another number means that they cannot be read.
+FORMAT = 1
+
+#: Units between two files of merged sums: so many are made again at most where one is damaged, and
+#: twice as many files of units are kept.
+UNITS_PER_SNAPSHOT = 16
+
+_DIGEST = 32  # bytes
+
+
+class Damaged(Exception):
+    """A file does not hold what was written."""
+
+
+class Refused(ValueError):
+    """A checkpoint belongs to another rendering."""
+
+
+# ------------------------------------------------------------------------------------------------
+#  Files
+# ------------------------------------------------------------------------------------------------
+
+
+def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays to a file that appears whole, and survives a loss of power once this returns.
+
+    Raises:
+        OSError: with a sentence that names the file, as where the disk is full. What was there
+            before stays.
+    """
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_bytes(path, hashlib.blake2b(buffer.getbuffer(), digest_size=_DIGEST).digest(), buffer)
+
+
+def write_bytes(path: Path, head: bytes, buffer: io.BytesIO) -> None:
+    """Write the bytes of ``head`` and ``buffer``, as :func:`write` does."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            file.write(head)
+            file.write(buffer.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _bring_to_disk(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _bring_to_disk(folder: Path) -> None:
+    """Make the names in a folder survive a loss of power, where the system can do that."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def read(path: Path) -> dict[str, np.ndarray] | None:
+    """The arrays of a file; None if there is none.
+
+    Raises:
+        Damaged: it does not hold what was written.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise Damaged(f"{path} cannot be read") from error
+    head, body = content[:_DIGEST], memoryview(content)[_DIGEST:]
+    if hashlib.blake2b(body, digest_size=_DIGEST).digest() != head:
+        raise Damaged(f"{path} is damaged")
+    with np.load(io.BytesIO(body), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+class UnitFiles:
+    """Units that are done, a file for each, in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, index: int) -> Path:
+        return self.folder / f"unit-{index:08d}.glint"
+
+    def save(self, index: int, tile: Tile, sums: np.ndarray) -> None:
+        """Keep the sums of a unit, and the tile that they belong to."""
+        corners = np.array([tile.x, tile.y, tile.width, tile.height], np.int64)
+        write(self.path(index), {"tile": corners, "sums": sums, "index": np.int64(index)})
+
+    def load(self, index: int) -> tuple[Tile, np.ndarray] | None:
+        """The tile and the sums of a unit, None if it is not there.
+
+        Raises:
+            Damaged: the file does not hold what was saved.
+        """
+        arrays = read(self.path(index))
+        if arrays is None:
+            return None
+        if int(arrays["index"]) != index:
+            raise Damaged(f"{self.path(index)} is another unit's")
+        return Tile(*(int(v) for v in arrays["tile"])), arrays["sums"]
+
+    def remove(self, index: int) -> None:
+        self.path(index).unlink(missing_ok=True)
+
+
+# ------------------------------------------------------------------------------------------------
+#  Checkpoint
+# ------------------------------------------------------------------------------------------------
+
+
+class Checkpoint:
+    """A folder that keeps what is done of an image.
+
+    It holds a description of the image, the units that are done, and, every
+    :data:`UNITS_PER_SNAPSHOT` units, the sums of all units so far; the last two of these, and the
+    units since the former of them. The folder's size does not depend on the number of samples.
+
+    Args:
+        folder: made if it is not there.
+        description: what decides the image, in words and numbers that JSON can write.
+
+    Raises:
+        Refused: the folder holds what is done of another image, or by another version.
+        OSError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, description: Mapping[str, object]) -> None:
+        self.folder = folder
+        self.units = UnitFiles(folder)
+        description = json.loads(json.dumps({"format": FORMAT, **description}))
+        path = folder / "rendering.json"
+        try:
+            known = json.loads(path.read_text("utf-8")) if path.exists() else None
+        except (OSError, ValueError):
+            raise Refused(
+                f"the checkpoint {folder} is damaged: {path.name} cannot be read"
+            ) from None
+        if known is None:
+            if folder.exists() and any(folder.iterdir()):
+                raise Refused(f"{folder} is not empty and no checkpoint of a rendering")
+            text = json.dumps(description, indent=2, ensure_ascii=False)
+            write_bytes(path, b"", io.BytesIO(text.encode()))
+        elif known != description:
+            raise Refused(_difference(folder, known, description))
+
+    def restore(self, image: Image) -> None:
+        """Give an empty image what is done, as far as it is merged."""
+        for path in sorted(self.folder.glob("sums-*.glint"), reverse=True):
+            try:
+                arrays = read(path)
+            except Damaged:
+                path.unlink(missing_ok=True)
+                continue
+            image.count = int(arrays["count"])
+            image.sums, image.odd = arrays["sums"], arrays["odd"]
+            return
+
+    def progressed(self, image: Image) -> None:
+        """Called after each unit that is merged."""
+        if image.count % UNITS_PER_SNAPSHOT and image.count < len(image.plan):
+            return
+        arrays = {"count": np.int64(image.count), "sums": image.sums, "odd": image.odd}
+        write(self._snapshot(image.count), arrays)
+        kept = sorted(self.folder.glob("sums-*.glint"))[-2:]
+        for path in self.folder.glob("sums-*.glint"):
+            if path not in kept:
+                path.unlink(missing_ok=True)
+        merged = int(kept[0].stem.split("-")[1]) if len(kept) > 1 else 0
+        for path in self.folder.glob("unit-*.glint"):
+            if int(path.stem.split("-")[1]) < merged:
+                path.unlink(missing_ok=True)
+
+    def _snapshot(self, count: int) -> Path:
+        return self.folder / f"sums-{count:08d}.glint"
+
+
+def _difference(folder: Path, known: Mapping[str, object], wanted: Mapping[str, object]) -> str:
+    """A sentence about what a checkpoint and a rendering differ in."""
+    for key in {**wanted, **known}:
+        if known.get(key) != wanted.get(key):
+            break
+    return (
+        f"the checkpoint {folder} belongs to another rendering: its {key} is {known.get(key)}, "
+        f"this one's is {wanted.get(key)}. Name another folder, or delete this one."
+    )
