@@ -6,10 +6,7 @@ Only what concerns the terminal is here; the work is done in other modules.
 from __future__ import annotations
 
 import re
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -21,6 +18,7 @@ from glintbsdf import __version__
 from glintbsdf.bridge import llvm
 from glintbsdf.check import plot as pndf_plot
 from glintbsdf.cli.doctor import examine
+from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
@@ -50,31 +48,6 @@ def main() -> NoReturn:
         if debug:
             raise
         sys.exit(f"Error: {one_line(str(error)) or type(error).__name__}")
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Let Ctrl-C end the block as KeyboardInterrupt, whatever the libraries below make of it.
-
-    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error
-    of their own in its place.
-    """
-    received = False
-
-    def receive(number: int, frame: object) -> None:
-        nonlocal received
-        received = True
-        signal.default_int_handler(number, frame)
-
-    previous = signal.signal(signal.SIGINT, receive)
-    try:
-        yield
-    except Exception as error:
-        if received:
-            raise KeyboardInterrupt from error
-        raise
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def one_line(message: str) -> str:
@@ -227,13 +200,25 @@ def render(
             rendering.Renderer(loaded, spp, denoise, missed) as renderer,
             progress("Rendering") as report,
         ):
-            picture = rendering.produce(
+            picture, interrupted = _produce(
                 renderer, seed, observe=lambda image: report(image.fraction)
             )
         if trimmed and not trimmed.sufficed:
             click.echo("Trimmed structures did not suffice: built in full.", err=True)
         rendering.save(picture.bitmap, unfinished)
     click.echo(path)
+    if interrupted:
+        raise click.ClickException(
+            f"interrupted: {path} has {100 * picture.fraction:.3g} % of the samples"
+        )
+
+
+def _produce(renderer: rendering.Renderer, seed: int, **options) -> tuple[rendering.Picture, bool]:
+    """An image, or what was done of it when Ctrl-C came, and whether it came."""
+    try:
+        return rendering.produce(renderer, seed, **options), False
+    except rendering.Interrupted as interrupt:
+        return interrupt.picture, True
 
 
 @commands.command()

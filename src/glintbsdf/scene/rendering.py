@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.interruption import interruptible
 from glintbsdf.scene import passes
 from glintbsdf.scene.denoising import denoised, guided
 from glintbsdf.scene.merging import Image, Results, merge
@@ -210,14 +211,15 @@ def produce(
     """
     image = Image(renderer.plan(seed), renderer.sensor.film().base_channels_count() + 1)
     try:
-        merge(
-            image,
-            render_all or renderer.render_all,
-            checkpoint,
-            until_noise,
-            time_limit,
-            observe,
-        )
+        with interruptible():
+            merge(
+                image,
+                render_all or renderer.render_all,
+                checkpoint,
+                until_noise,
+                time_limit,
+                observe,
+            )
     except KeyboardInterrupt as interrupt:
         if image.sums is None:
             raise
