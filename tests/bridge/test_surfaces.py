@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -143,3 +146,14 @@ def test_green_that_does_not_fit_the_surface_is_told(
         mi.render(scene(plate=shape | {"bsdf": glints(values, to_uv=to_uv, **options)}), spp=1)
         output = "".join(capfd.readouterr())
         assert ('"flip_y" true turns it' in output) == (not fits and not options)
+
+
+def test_without_any_shape_there_is_an_end():
+    code = (
+        "import glintbsdf, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
+        "from glintbsdf.bridge import surfaces; print(list(surfaces.live_shapes()))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=100
+    )
+    assert result.stdout.strip() == "[]"

@@ -6,6 +6,8 @@ active variant, also those inside a ``shapegroup``, which ``scene.shapes()`` lea
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Iterator
 
 import drjit as dr
@@ -21,16 +23,19 @@ _MIXED = 0.1
 
 def live_shapes() -> Iterator[mi.Shape]:
     """Every shape of the active variant that is alive."""
-    index = 1
-    while True:
-        pointer = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(index))
-        try:
-            shape = pointer[0]
-        except RuntimeError:  # beyond the last one; a place that is free again gives None
+
+    def at(index: int) -> mi.Shape | None:
+        return dr.reinterpret_array(mi.ShapePtr, mi.UInt32(index))[0]
+
+    # Beyond the last place Dr.Jit raises an error, if there ever was a shape; else all are empty,
+    # as is a place that is free again.
+    with contextlib.suppress(RuntimeError):
+        if at(2**31) is None:
             return
-        if shape is not None:
-            yield shape
-        index += 1
+    with contextlib.suppress(RuntimeError):
+        for index in itertools.count(1):
+            if (shape := at(index)) is not None:
+                yield shape
 
 
 def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:

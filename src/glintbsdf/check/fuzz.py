@@ -1,0 +1,411 @@
+"""Values of every kind for every parameter of every plugin: each is used, or refused in a sentence.
+
+A case is a plugin and one or two of its parameters with values of any kind: numbers from 1e-45 to
+1e39, NaN, names, colours, vectors, transforms, tensors, images, textures, nested materials; and
+parameters that do not exist. One of two must come of it: an error of one sentence that names the
+plugin and the parameter that was written; or a BSDF that evaluates and samples to finite numbers
+from the zenith to the horizon, for footprints from a point to many maps.
+
+:func:`cases` and :func:`outcome` work in this process. :func:`fuzz` runs any number of cases in
+processes of their own, so that crashes and endless loops are outcomes as well. It is the long check
+of the stability report::
+
+    from glintbsdf.check.fuzz import fuzz
+    print(fuzz(20_000, seed=1))
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from multiprocessing.connection import wait
+from typing import Any, NamedTuple
+
+import numpy as np
+
+#: Seconds that a case may take; a new kernel alone takes some.
+PATIENCE = 60.0
+
+#: What a case may end as; anything else is a fault.
+GOOD = ("used", "refused", "refused by Mitsuba")
+
+_NUMBERS = (0, 1, -1, 7, 2**31, 2**40, -(2**40))
+_FLOATS = (
+    0.0,
+    -0.0,
+    1e-45,
+    1e-30,
+    1e-12,
+    1e-8,
+    1e-4,
+    0.01,
+    0.3,
+    0.5,
+    1.0,
+    1.5,
+    3.0,
+    20.0,
+    1e3,
+    1e4,
+)
+_EXTREMES = (1e6, 1e9, 1e20, 1e30, 3e38, 1e39, 1e300, -1e-8, -0.5, -1e30)
+_STRANGE = (float("nan"), float("inf"), float("-inf"))
+_NAMES = (
+    "",
+    "none",
+    "0.5",
+    "true",
+    "gauss",
+    "ggx",
+    "beckmann",
+    "Au",
+    "bk7",
+    "a\nb",
+    'a "b" c',
+    "x" * 500,
+)
+
+
+class Case(NamedTuple):
+    """A plugin and what is written of its parameters, as makers of values by name."""
+
+    plugin: str
+    changes: dict[str, tuple[str, Any]]
+
+    def __str__(self) -> str:
+        values = ", ".join(
+            f"{name} = {kind} {value!r}"[:90] for name, (kind, value) in self.changes.items()
+        )
+        return f"{self.plugin}: {values}"
+
+
+def cases(seed: int, count: int, plugins: tuple[str, ...] = ()) -> Iterator[Case]:
+    """``count`` cases, the same for the same seed; of ``plugins``, or of all that declare
+    parameters."""
+    from glintbsdf.bridge.parameters import PARAMETERS, Number
+
+    rng = np.random.default_rng(seed)
+    plugins = plugins or tuple(PARAMETERS)
+
+    def choose(values):
+        return values[int(rng.integers(len(values)))]
+
+    def value(declaration) -> tuple[str, Any]:
+        if isinstance(declaration, Number) and rng.random() < 0.25:  # at and about its ends
+            low, high = declaration.minimum, declaration.maximum
+            number = choose(
+                (
+                    low,
+                    high,
+                    low + rng.random() * (high - low),
+                    np.nextafter(low, -1e300),
+                    np.nextafter(high, 1e300),
+                )
+            )
+            return "number", int(number) if declaration.whole else float(number)
+        kind = choose(
+            (
+                "number",
+                "number",
+                "float",
+                "float",
+                "float",
+                "extreme",
+                "strange",
+                "name",
+                "name",
+                "flag",
+                "colour",
+                "vector",
+                "point",
+                "transform",
+                "tensor",
+                "array",
+                "bitmap",
+                "texture",
+                "spectrum",
+                "rgb",
+                "bsdf",
+            )
+        )
+        values = {
+            "number": _NUMBERS,
+            "float": _FLOATS,
+            "extreme": _EXTREMES,
+            "strange": _STRANGE,
+            "name": _NAMES,
+            "flag": (False, True),
+        }
+        return kind, choose(values.get(kind, _FLOATS + _EXTREMES + _STRANGE))
+
+    for _ in range(count):
+        plugin = choose(plugins)
+        declared = PARAMETERS[plugin]
+        names = list(declared)
+        changes = {}
+        for _ in range(1 if rng.random() < 0.8 else 2):
+            name = choose(names)
+            if rng.random() < 0.03:  # a slip of the pen
+                name = name[:-1] if rng.random() < 0.5 else name + "x"
+            changes[name] = value(declared.get(name))
+        yield Case(plugin, changes)
+
+
+# --------------------------------------------------------------------------------------------------
+#  One case
+# --------------------------------------------------------------------------------------------------
+
+
+def made(kind: str, value: Any) -> Any:
+    """The value of a case as ``mi.load_dict`` takes it."""
+    import mitsuba as mi
+
+    number = float(value) if isinstance(value, int | float) else 0.0
+    with np.errstate(over="ignore"):
+        pixels = np.full((4, 4, 3), number).astype(np.float32)
+    makers: dict[str, Callable[[], Any]] = {
+        "colour": lambda: mi.ScalarColor3d(number, 0.5, 0.2),
+        "vector": lambda: mi.ScalarVector3d(number, 1, 2),
+        "point": lambda: [number, 1.0, 2.0],
+        "transform": lambda: mi.ScalarTransform4f().scale([number, 1, 1]),
+        "tensor": lambda: mi.TensorXf(pixels),
+        "array": lambda: mi.Float([number, 1.0]),
+        "bitmap": lambda: mi.Bitmap(pixels),
+        "texture": lambda: {"type": "checkerboard"},
+        "spectrum": lambda: {"type": "spectrum", "value": [(400.0, number), (700.0, 0.5)]},
+        "rgb": lambda: {"type": "rgb", "value": [number, 0.5, 0.2]},
+        "bsdf": lambda: {"type": "diffuse"},
+    }
+    return makers[kind]() if kind in makers else value
+
+
+def base(plugin: str) -> dict:
+    """A small valid description of a plugin."""
+    import mitsuba as mi
+
+    from glintbsdf.maps import isotropic
+
+    description: dict = {"type": plugin}
+    if plugin not in ("glint_grid", "glint_particles", "glint_path"):
+        size = 16 if plugin == "glint_mip" else 8
+        description["data"] = mi.TensorXf(isotropic(size, alpha=0.2).normals)
+    if plugin == "glint_mip":
+        description |= {"output_size": 32, "patch_size": 8, "clusters": 2}
+    return description
+
+
+def outcome(case: Case) -> str:
+    """What comes of a case: one of :data:`GOOD`, or a sentence about the fault."""
+    import mitsuba as mi
+
+    description = base(case.plugin)
+    if {"filename", "bitmap", "flake_density"} & set(case.changes):
+        description.pop("data", None)
+    try:
+        description |= {name: made(*value) for name, value in case.changes.items()}
+    except Exception:
+        return "refused by Mitsuba"  # before any plugin has seen it
+    try:
+        loaded = mi.load_dict(description)
+    except Exception as error:
+        return judged(case, str(error))
+    try:
+        return "used" if not hasattr(loaded, "eval_pdf") else judged_values(loaded)
+    except Exception as error:
+        return f"evaluation fails: {type(error).__name__}: {str(error)[-300:]}"
+
+
+def judged(case: Case, message: str) -> str:
+    """Whether an error is a sentence that names the plugin and a parameter that was written."""
+    lines = message.strip().splitlines()
+    if "Traceback" not in message:
+        # Mitsuba's own: a value that properties cannot hold, or a parameter that is of no use here.
+        named = any(f'"{name}"' in message or name in message for name in case.changes)
+        return (
+            "refused by Mitsuba" if named or "nstantiat" not in message else "other: " + lines[-1]
+        )
+    told = [line for line in lines if re.search(rf"{case.plugin}: ", line)]
+    if len(told) != 1:
+        return "no sentence: " + lines[-1]
+    groups = [case.changes]
+    if {"filename", "bitmap", "flake_density"} & set(case.changes):
+        groups.append({"filename": 0, "bitmap": 0, "data": 0})
+    if any(f'"{name}"' in told[0] for group in groups for name in group):
+        return "refused"
+    return "another parameter is named: " + told[0]
+
+
+def judged_values(bsdf: Any) -> str:
+    """Whether values, densities and samples of a BSDF are finite and not negative."""
+    import drjit as dr
+    import mitsuba as mi
+
+    views = [(0.0, 0.0, 1.0), (0.6, 0.2, 0.5), (1.0, 0.0, 1e-3), (0.3, -0.4, 0.9)]
+    widths = [0.0, 1e-6, 0.02, 0.3, 1.0, 30.0]
+    lanes = [(view, width) for view in views for width in widths]
+    si = dr.zeros(mi.SurfaceInteraction3f, len(lanes))
+    si.uv = mi.Point2f(0.37, 0.61)
+    wi = np.array([view for view, _ in lanes]).T
+    si.wi = mi.Vector3f(np.float32(wi / np.linalg.norm(wi, axis=0)))
+    width = mi.Float(np.float32([width for _, width in lanes]))
+    si.duv_dx, si.duv_dy = mi.Vector2f(width, 0), mi.Vector2f(0.2 * width, 0.7 * width)
+    si.t, si.n = 1, mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(si.n))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    if mi.is_spectral:
+        si.wavelengths = [440, 510, 580, 650]
+    dr.make_opaque(si)
+    u = np.random.default_rng(1).random((3, len(lanes)), dtype=np.float32)
+    ctx = mi.BSDFContext()
+    bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])))
+    wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(mi.Float(u[1]), mi.Float(u[0])))
+    values = {
+        "weight": weight,
+        "sampled pdf": bs.pdf,
+        "value": bsdf.eval_pdf(ctx, si, wo)[0],
+        "value at sample": bsdf.eval_pdf(ctx, si, bs.wo)[0],
+        "pdf": bsdf.eval_pdf(ctx, si, bs.wo)[1],
+    }
+    if mi.is_polarized:
+        values = {k: v[0, 0] if isinstance(v, mi.Spectrum) else v for k, v in values.items()}
+    dr.eval(values)
+    for name, value in values.items():
+        array = np.array(value)
+        if not np.isfinite(array).all():
+            return f"{name} is not finite"
+        if (array < 0).any():
+            return f"{name} is negative"
+    return "used"
+
+
+# --------------------------------------------------------------------------------------------------
+#  Many cases
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Report:
+    """Outcomes of many cases.
+
+    Attributes:
+        counts: how often each good outcome, and "fault", came.
+        faults: what came of each case that ended otherwise.
+        slowest: seconds of the slowest case, and the case.
+    """
+
+    counts: Counter = field(default_factory=Counter)
+    faults: list[tuple[Case, str]] = field(default_factory=list)
+    slowest: tuple[float, str] = (0.0, "")
+
+    def add(self, case: Case, result: str, seconds: float = 0.0) -> None:
+        good = result in GOOD
+        self.counts[result if good else "fault"] += 1
+        if not good:
+            self.faults.append((case, result))
+        self.slowest = max(self.slowest, (seconds, str(case)))
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{count} {name}" for name, count in sorted(self.counts.items()))
+        lines = [f"{self.counts.total()} cases: {counts}"]
+        lines += [f"{case}\n    {result}" for case, result in self.faults]
+        return "\n".join([*lines, f"slowest: {self.slowest[0]:.1f} s, {self.slowest[1]}"])
+
+
+def fuzz(
+    count: int,
+    seed: int = 0,
+    variant: str = "llvm_ad_rgb",
+    workers: int = 1,
+    plugins: tuple[str, ...] = (),
+    report: Callable[[float], None] = lambda fraction: None,
+) -> Report:
+    """Run ``count`` cases in ``workers`` processes of their own, whose ends are outcomes, too.
+
+    ``plugins`` as in :func:`cases`; ``report`` is called with the fraction done.
+    """
+    context = multiprocessing.get_context("spawn")
+    result = Report()
+    waiting = list(range(count))[::-1]
+    running: dict = {}
+    every = None
+
+    def start() -> None:
+        mine, others = context.Pipe()
+        process = context.Process(
+            target=_work, args=(others, seed, count, variant, plugins), daemon=True
+        )
+        process.start()
+        others.close()
+        running[mine] = [process, None, time.monotonic()]
+
+    def give(connection) -> None:
+        if waiting:
+            running[connection][1:] = [waiting.pop(), time.monotonic()]
+            connection.send(running[connection][1])
+        else:
+            connection.send(None)
+            running.pop(connection)[0].join()
+
+    for _ in range(max(1, workers)):
+        start()
+    every = _known_cases(seed, count, variant, plugins)
+    while running:
+        ready = wait(list(running), timeout=1.0)
+        for connection in ready:
+            process, index, since = running[connection]
+            try:
+                message = connection.recv()
+            except EOFError:
+                process.join()
+                if index is not None:
+                    result.add(every[index], f"the process ended with {process.exitcode}")
+                del running[connection]
+                if waiting:
+                    start()
+                continue
+            if index is not None:
+                result.add(every[index], message, time.monotonic() - since)
+                report(result.counts.total() / count)
+            give(connection)
+        for connection, (process, index, since) in list(running.items()):
+            if index is not None and time.monotonic() - since > PATIENCE:
+                process.kill()
+                process.join()
+                result.add(every[index], f"no end after {PATIENCE:.0f} s", PATIENCE)
+                del running[connection]
+                if waiting:
+                    start()
+    return result
+
+
+def _known_cases(seed: int, count: int, variant: str, plugins: tuple[str, ...]) -> list[Case]:
+    _activate(variant)
+    return list(cases(seed, count, plugins))
+
+
+def _activate(variant: str) -> None:
+    import glintbsdf  # noqa: F401  (names the LLVM library before a variant is chosen)
+
+    import mitsuba as mi  # isort: skip
+
+    if mi.variant() != variant:
+        mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def _work(connection, seed: int, count: int, variant: str, plugins: tuple[str, ...]) -> None:
+    """Take numbers of cases, give outcomes; the first message says that all is ready."""
+    every = _known_cases(seed, count, variant, plugins)
+    connection.send("ready")
+    while (index := connection.recv()) is not None:
+        connection.send(outcome(every[index]))
+
+
+if __name__ == "__main__":
+    import sys
+
+    print(fuzz(int(sys.argv[1]), *map(int, sys.argv[2:3]), workers=2))
