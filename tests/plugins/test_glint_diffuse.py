@@ -95,6 +95,12 @@ def test_flat_is_mitsubas_diffuse(variant, method):
     assert dr.allclose(pdf, theirs.pdf(ctx, si, wo))
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["isotropic", "tilted"])
+def test_light_tracing_meets_the_same_surface(variant, method, name):
+    suite.check_adjoint(load(MAPS[name], method=method), RESOLVED)
+
+
 def test_oren_nayar(variant):
     # Oren and Nayar's worked-out cases: no roughness is Lambert; at σ² = 0.33·0.45 … the factors A
     # and B of Eq. 30 themselves, for light and view in one plane.

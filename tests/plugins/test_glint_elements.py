@@ -93,6 +93,7 @@ def test_consistency(variant, kind):
         suite.check_eval_pdf(bsdf, view, count=500)
         suite.check_weights(bsdf, view, count=500)
         suite.check_horizon(bsdf, view, count=200)
+        suite.check_adjoint(bsdf, view)
 
 
 @pytest.mark.parametrize("kind", ["curved", "flakes"])

@@ -93,6 +93,8 @@ def test_consistency(variant, method, distribution):
         suite.check_eval_pdf(bsdf, view)
         suite.check_weights(bsdf, view)
         suite.check_horizon(bsdf, view)
+        if method != "leadr":
+            suite.check_adjoint(bsdf, view)
 
 
 @pytest.mark.parametrize(("method", "distribution"), LOBES)

@@ -357,6 +357,7 @@ def test_consistency(variant, name):
         # Where the half vector recomputed from wo falls into another cell, so does the count.
         suite.check_weights(bsdf, view)
         suite.check_horizon(bsdf, view)
+        suite.check_adjoint(bsdf, view)
 
 
 @pytest.mark.parametrize("name", SURFACES)

@@ -128,6 +128,7 @@ def test_consistency(variant, material):
         suite.check_eval_pdf(bsdf, view)
         suite.check_weights(bsdf, view)
         suite.check_horizon(bsdf, view)
+        suite.check_adjoint(bsdf, view)
 
 
 @pytest.mark.parametrize("name", ["isotropic", "brushed", "flat", "one_texel", "clamp"])

@@ -96,6 +96,7 @@ def test_consistency(variant, name):
         suite.check_eval_pdf(bsdf, seen)
         suite.check_weights(bsdf, seen)
         suite.check_horizon(bsdf, seen)
+        suite.check_adjoint(bsdf, seen)
 
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])

@@ -30,6 +30,9 @@ import numpy as np
 #: Seconds that a case may take; a new kernel alone takes some.
 PATIENCE = 60.0
 
+#: Values beyond these are allowed and take long, as there is much to build.
+_COSTLY = {"output_size": 128, "flake_density": 1e5}
+
 #: What a case may end as; anything else is a fault.
 GOOD = ("used", "refused", "refused by Mitsuba")
 
@@ -151,7 +154,10 @@ def cases(seed: int, count: int, plugins: tuple[str, ...] = ()) -> Iterator[Case
             name = choose(names)
             if rng.random() < 0.03:  # a slip of the pen
                 name = name[:-1] if rng.random() < 0.5 else name + "x"
-            changes[name] = value(declared.get(name))
+            kind, given = value(declared.get(name))
+            if name in _COSTLY and declared[name].holds(given):
+                given = min(given, _COSTLY[name])
+            changes[name] = kind, given
         yield Case(plugin, changes)
 
 

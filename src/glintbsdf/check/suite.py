@@ -312,6 +312,30 @@ def check_finite(bsdf: mi.BSDF, view: View, count: int = 200) -> None:
         assert dr.all(dr.isfinite(x) & (x >= 0), axis=None)
 
 
+def check_adjoint(bsdf: mi.BSDF, view: View, count: int = 500, strays: float = 0.01) -> None:
+    """Light that goes the other way meets the same BSDF: f of importance is f with directions
+    exchanged.
+
+    ``f(wi, wo)``, by radiance, is what light from ``wo`` gives ``wi``. Light tracing asks for the
+    adjoint, with ``wi`` towards the light: ``f*(wo, wi) = f(wi, wo)``. A BSDF whose normals lean
+    differently from the surface is not reciprocal, but this holds for every BSDF. A share of
+    ``strays`` may differ: a half vector rounded otherwise, at an edge.
+    """
+    si, bs, _ = sample(bsdf, view, count)
+    wo = dr.detach(bs.wo)
+    dr.eval(wo)
+    importance = mi.BSDFContext()
+    importance.mode = mi.TransportMode.Importance
+    back = view.interaction(count)
+    back.wi = wo
+    f = intensity(bsdf.eval(mi.BSDFContext(), si, wo)) / wo.z
+    adjoint = intensity(bsdf.eval(importance, back, si.wi)) / si.wi.z
+    valid = np.array((bs.pdf > 0) & (wo.z > 1e-3))
+    f, adjoint = (np.atleast_2d(np.array(x))[:, valid] for x in (f, adjoint))
+    apart = (np.abs(f - adjoint) > 1e-3 * (np.abs(f) + np.abs(adjoint)) + 1e-6).any(axis=0)
+    assert apart.mean() <= strays, apart.mean()
+
+
 def check_furnace(bsdf: mi.BSDF, *views: View, count: int = 20_000) -> None:
     """Of uniform light views reflect, on average, no more than arrives, but for noise (3 sigma)."""
     weights = [intensity(sample(bsdf, view, count)[2]) for view in views]

@@ -80,11 +80,18 @@ class OrenNayarDiffuse:
         )
 
     def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
-        """``f cosθ_o``; zero where either direction is below the mean facet. Reciprocal."""
+        """``f cosθ_o``; zero where either direction is below the mean facet.
+
+        The model is reciprocal about the mean normal, but cosθ_o is that to the surface, as inside
+        ``normalmap``: where importance is transported, directions change places.
+        """
         x, y, slope_x, slope_y, squared = self.pyramid.average(footprint)
         variance = 0.5 * dr.maximum(squared - slope_x * slope_x - slope_y * slope_y, 0)
         frame = mi.Frame3f(mi.Normal3f(x, y, dr.safe_sqrt(1 - x * x - y * y)))
-        return oren_nayar(frame.to_local(wi), frame.to_local(wo), variance)
+        local_i, local_o = frame.to_local(wi), frame.to_local(wo)
+        if mode == mi.TransportMode.Importance:
+            return oren_nayar(local_o, local_i, variance) * (wo.z / wi.z)
+        return oren_nayar(local_i, local_o, variance)
 
     def __repr__(self) -> str:
         return f"oren_nayar[{self.pyramid.nbytes / 2**20:.1f} MiB]"
