@@ -65,7 +65,7 @@ from _common import (  # noqa: E402
 from glintbsdf import maps  # noqa: E402
 from glintbsdf.footprint.gaussian import Footprint  # noqa: E402
 from glintbsdf.microfacet.frame import normal_from_projection  # noqa: E402
-from glintbsdf.pndf.manifold.exact import TexelMesh  # noqa: E402
+from glintbsdf.pndf.manifold.mesh import TexelMesh  # noqa: E402
 from glintbsdf.pndf.manifold.projected_area import (  # noqa: E402
     ORDERS,
     Corners,

@@ -66,7 +66,7 @@ from rich.table import Table  # noqa: E402
 import glintbsdf  # noqa: E402, F401  (registers the plugins)
 from glintbsdf import NormalMap, maps  # noqa: E402
 from glintbsdf.core.progress import progress  # noqa: E402
-from glintbsdf.pndf.manifold.exact import equilateral  # noqa: E402
+from glintbsdf.pndf.manifold.mesh import equilateral  # noqa: E402
 from glintbsdf.scene.rendering import replacing  # noqa: E402
 
 if mi.variant() is None:

@@ -73,10 +73,10 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import FootprintBSDF
 from glintbsdf.bridge.parameters import Parameters
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.microfacet.frame import above_horizon
 from glintbsdf.pndf.manifold.diffuse import FacetDiffuse, OrenNayarDiffuse
-from glintbsdf.pndf.manifold.exact import TexelMesh
+from glintbsdf.pndf.manifold.mesh import TexelMesh
 
 METHODS = ("manifold", "oren_nayar")
 
@@ -99,17 +99,17 @@ class GlintDiffuse(FootprintBSDF):
             | mi.BSDFFlags.Anisotropic
         )
         self.m_components = [self.m_flags]
-        if not self.waits:
+        if not self.deferred:
             self.build()
 
-    def build(self, reach: Reach | None = None) -> None:
+    def build(self, domain: Domain | None = None) -> None:
         if self.method_name == "manifold":
             self.method = FacetDiffuse(self.mesh)
         else:
-            self.method = OrenNayarDiffuse(self.mesh, reach)
+            self.method = OrenNayarDiffuse(self.mesh, domain)
 
     def parts(self) -> dict[str, int]:
-        return self.mesh.parts | getattr(self.method, "parts", {})
+        return self.mesh.parts() | (self.method.parts() if self.method is not None else {})
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.mesh.traverse(callback)
@@ -150,10 +150,10 @@ class GlintDiffuse(FootprintBSDF):
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection):
             return mi.Spectrum(0), mi.Float(0)
         active, wi, wo = above_horizon(active, si.wi, wo)
-        footprint = self.footprint(si, active)
-        white = wo.z * (1 / pi)  # as long as it waits to be built
+        query = self.query(si, active)
+        white = wo.z * (1 / pi)  # as long as nothing is built
         if self.method is not None:
-            white = self.method.eval(wi, wo, ctx.mode, footprint, active)
+            white = self.method.eval(wi, wo, ctx.mode, query, active)
         value = dr.select(active, self.reflectance.eval(si, active) * white, 0)
         pdf = dr.select(active, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
         return mi.mueller.depolarizer(value) if mi.is_polarized else value, pdf

@@ -109,19 +109,11 @@ section 5.
 
 from __future__ import annotations
 
-from functools import partial
-
 import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import MAP_SOURCES, Parameters
-from glintbsdf.footprint.domain import Reach
-from glintbsdf.microfacet.frame import (
-    BeckmannMasking,
-    FlakesBeckmannLobe,
-    MapBeckmannLobe,
-    MapBeckmannMasking,
-)
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Elements, Flakes
 
 
@@ -132,36 +124,27 @@ class GlintElements(GlintBSDF):
         super().__init__(props)
         parameters = Parameters(props)
         parameters.only_one_of(MAP_SOURCES, ("flake_density",))
-        sigma_r = parameters.number("sigma_r", 0.005)
-        masked = parameters.choice("masking", "beckmann", ("beckmann", "none")) == "beckmann"
+        self.options = {"sigma_r": parameters.number("sigma_r", 0.005), "owner": self.owner}
+        self.masking_name = parameters.choice("masking", "beckmann", Elements.maskings)
         if "flake_density" in props:
-            self.pndf = Flakes(
-                parameters.number("flake_density", 0.0),
-                parameters.number("flake_alpha", 0.2),
-                sigma_r,
-                parameters.whole("seed", 0),
-                self.owner,
-            )
-            self.masking = BeckmannMasking(mi.Vector2f(self.pndf.alpha**2)) if masked else None
-            self.smooth = FlakesBeckmannLobe(self.pndf)
-            return
-        self.normal_map = parameters.normal_map(instead="flake_density")
-        self.create = partial(
-            Elements,
-            self.normal_map,
-            sigma_r,
-            parameters.number("step", 0.5),
-            parameters.choice("elements", "curved", ("curved", "flat")) == "curved",
-            self.owner,
-        )
-        self.create_masking = MapBeckmannMasking if masked else lambda pndf: None
-        if not self.waits:
-            self.build()
+            self.options |= {
+                "density": parameters.number("flake_density", 0.0),
+                "alpha": parameters.number("flake_alpha", 0.2),
+                "seed": parameters.whole("seed", 0),
+            }
+        else:
+            self.normal_map = parameters.normal_map(instead="flake_density")
+            elements = parameters.choice("elements", "curved", ("curved", "flat"))
+            self.options |= {
+                "step": parameters.number("step", 0.5),
+                "curved": elements == "curved",
+            }
+        self.finish()
 
-    def build(self, reach: Reach | None = None) -> None:
-        self.pndf = self.create(reach=reach)
-        self.masking = self.create_masking(self.pndf)
-        self.smooth = MapBeckmannLobe(self.pndf)
+    def create(self, domain: Domain | None) -> Elements | Flakes:
+        if self.normal_map is None:
+            return Flakes(**self.options)
+        return Elements(self.normal_map, domain=domain, **self.options)
 
 
 mi.register_bsdf("glint_elements", lambda props: GlintElements(props))

@@ -98,17 +98,14 @@ Reference: Tomas Akenine-Möller et al., "Real-Time Rendering", 4th edition, sec
 
 from __future__ import annotations
 
-from functools import partial
-
 import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
 from glintbsdf.core.errors import check
-from glintbsdf.footprint.domain import Reach
-from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS
-from glintbsdf.pndf.filters.filters import METHODS, Filtered, LobeMasking, VisibleNormals
+from glintbsdf.pndf.filters.filters import METHODS, Filtered
 
 
 class GlintFiltered(GlintBSDF):
@@ -119,42 +116,26 @@ class GlintFiltered(GlintBSDF):
         parameters = Parameters(props)
         method = parameters.choice("method", "lean", tuple(METHODS))
         self.normal_map = parameters.normal_map()
-        self.create = partial(
-            Filtered,
-            self.normal_map,
-            method=method,
-            alpha=parameters.number("alpha", 0.05),
-            distribution=parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
-            max_anisotropy=parameters.number("max_anisotropy", 16.0),
-            owner=self.owner,
-        )
-        masking = parameters.choice("masking", "smith", ("smith", "none"))
+        self.options = {
+            "method": method,
+            "alpha": parameters.number("alpha", 0.05),
+            "distribution": parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
+            "max_anisotropy": parameters.number("max_anisotropy", 16.0),
+            "owner": self.owner,
+        }
+        self.masking_name = parameters.choice("masking", "smith", Filtered.maskings)
         check(
-            masking == "smith" or method != "leadr",
+            self.masking_name == "smith" or method != "leadr",
             self.owner,
             "masking",
             "smith for leadr, whose part it is",
-            masking,
+            self.masking_name,
         )
-        height_correlated = parameters.boolean("height_correlated", True)
-        self.create_masking = lambda: None
-        if masking == "smith":
-            self.create_masking = lambda: LobeMasking(
-                self.pndf, height_correlated, projection=method == "leadr"
-            )
-        if not self.waits:
-            self.build()
+        self.height_correlated = parameters.boolean("height_correlated", True)
+        self.finish()
 
-    def build(self, reach: Reach | None = None) -> None:
-        self.pndf = self.create(reach=reach)
-        self.masking = self.create_masking()
-
-    def normals(self) -> VisibleNormals:
-        return VisibleNormals(self.pndf)
-
-    def footprint(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Footprint:
-        footprint = super().footprint(si, active)
-        return footprint if self.pndf is None else self.pndf.with_lobe(footprint)
+    def create(self, domain: Domain | None) -> Filtered:
+        return Filtered(self.normal_map, domain=domain, **self.options)
 
 
 mi.register_bsdf("glint_filtered", lambda props: GlintFiltered(props))

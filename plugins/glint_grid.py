@@ -135,15 +135,16 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
-from glintbsdf.bridge.spectra import ColorConversion
-from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.microfacet.frame import BeckmannLobe, VisibleBeckmannNormals
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Grid
 from glintbsdf.pndf.grid.microdetails import Palette, Wheel
 
 
 class GlintGrid(GlintBSDF):
     """The plugin ``glint_grid``."""
+
+    masking_name = "beckmann"
+    height_correlated = False  # as roughconductor
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -153,46 +154,23 @@ class GlintGrid(GlintBSDF):
             colors = {"none": None, "wheel": Wheel()}[colors]
         else:
             colors = Palette(colors)
-        self.color_conversion = None if colors is None else ColorConversion()
-        self.pndf = Grid(
-            alpha=parameters.per_axis("alpha", 0.3),
-            detail_alpha=parameters.per_axis("detail_alpha", 0.05),
-            density=parameters.number("density", 8.0),
-            size_variation=parameters.number("size_variation", 0.3),
-            intensity=parameters.number("intensity", 1.0),
-            light_spread=parameters.number("light_spread", 0.0),
-            colors=colors,
-            max_anisotropy=parameters.number("max_anisotropy", 16.0),
-            seed=parameters.whole("seed", 0),
-            owner=self.owner,
-        )
-        self.derive()
+        self.options = {
+            "alpha": parameters.per_axis("alpha", 0.3),
+            "detail_alpha": parameters.per_axis("detail_alpha", 0.05),
+            "density": parameters.number("density", 8.0),
+            "size_variation": parameters.number("size_variation", 0.3),
+            "intensity": parameters.number("intensity", 1.0),
+            "light_spread": parameters.number("light_spread", 0.0),
+            "colors": colors,
+            "max_anisotropy": parameters.number("max_anisotropy", 16.0),
+            "seed": parameters.whole("seed", 0),
+            "owner": self.owner,
+        }
+        # Nothing is stored: there is nothing to wait for.
+        self.build()
 
-    def derive(self) -> None:
-        """What depends on the roughness."""
-        self.smooth = BeckmannLobe(self.pndf.alpha)
-        self.masking = self.smooth.masking
-
-    def parameters_changed(self, keys: list[str] = ()) -> None:
-        super().parameters_changed(keys)
-        self.derive()
-
-    def normals(self) -> VisibleBeckmannNormals:
-        return self.smooth.normals
-
-    def density(
-        self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool
-    ) -> mi.Float | mi.UnpolarizedSpectrum:
-        density = super().density(si, m, footprint, active)
-        if self.color_conversion is None:
-            return density
-        return self.color_conversion.eval(density, si, active)
-
-    def mean_tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        tint = self.pndf.intensity * super().mean_tint(si, active)
-        if self.color_conversion is None:
-            return tint
-        return tint * self.color_conversion.eval(mi.Color3f(*self.pndf.colors.mean), si, active)
+    def create(self, domain: Domain | None) -> Grid:
+        return Grid(**self.options)
 
 
 mi.register_bsdf("glint_grid", lambda props: GlintGrid(props))

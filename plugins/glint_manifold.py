@@ -112,20 +112,15 @@ Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), s
 
 from __future__ import annotations
 
-from functools import partial
-
 import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
 from glintbsdf.core.errors import check
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.kernels import KERNELS
-from glintbsdf.microfacet.frame import MapBeckmannLobe, MapBeckmannMasking
 from glintbsdf.pndf import ClusteredManifold, HandOver, Manifold, TabulatedManifold
-from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
-
-MASKINGS = ("ggx_fit", "analytic", "beckmann", "none")
+from glintbsdf.pndf.base import PNDF
 
 
 class GlintManifold(GlintBSDF):
@@ -148,36 +143,28 @@ class GlintManifold(GlintBSDF):
             "epsilon": parameters.number("epsilon", 1e-6),
             "owner": self.owner,
         }
-        self.threshold, self.max_error = threshold, max_error
-        self.masking_name = parameters.choice("masking", "ggx_fit", MASKINGS)
+        self.method: type[Manifold] = Manifold
+        if threshold:
+            self.method = ClusteredManifold
+            self.options["threshold"] = threshold
+        elif max_error:
+            self.method = TabulatedManifold
+            self.options["max_error"] = max_error
+        self.masking_name = parameters.choice("masking", "ggx_fit", Manifold.maskings)
         self.height_correlated = parameters.boolean("height_correlated", True)
         self.hand_over = parameters.number("hand_over", 0.0)
-        if not self.waits:
-            self.build()
+        self.finish()
 
-    def build(self, reach: Reach | None = None) -> None:
-        create = Manifold
-        if self.threshold:
-            create = partial(ClusteredManifold, threshold=self.threshold)
-        elif self.max_error:
-            create = partial(TabulatedManifold, max_error=self.max_error)
-        mesh = create(self.normal_map, reach=reach, **self.options)
-        masking = {
-            "ggx_fit": lambda: ProjectedAreaMasking(GgxFit(mesh, reach), self.height_correlated),
-            "analytic": lambda: ProjectedAreaMasking(ProjectedArea(mesh), self.height_correlated),
-            "beckmann": lambda: MapBeckmannMasking(mesh, self.height_correlated),
-            "none": lambda: None,
-        }
-        self.masking = masking[self.masking_name]()
-        self.smooth = MapBeckmannLobe(mesh)
-        self.pndf = mesh
-        if self.hand_over and (reach is None or reach.largest > self.hand_over):
-            self.pndf = HandOver(mesh, self.hand_over, self.owner, reach)
+    def create(self, domain: Domain | None) -> PNDF:
+        pndf = self.method(self.normal_map, domain=domain, **self.options)
+        if self.hand_over and (domain is None or domain.largest > self.hand_over):
+            return HandOver(pndf, self.hand_over, self.owner, domain)
+        return pndf
 
     def left_out(self) -> list[str]:
         features = {
-            "clusters: threshold is 0": self.threshold,
-            "tables: max_error is 0": self.max_error,
+            "clusters: threshold is 0": "threshold" in self.options,
+            "tables: max_error is 0": "max_error" in self.options,
             "smooth lobe: hand_over is 0": self.hand_over,
         }
         return [name for name, value in features.items() if not value] + super().left_out()

@@ -151,7 +151,8 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
-from glintbsdf.microfacet.frame import MapBeckmannLobe, MapBeckmannMasking
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.maps.normalmap import MapShape
 from glintbsdf.pndf import Mip
 
 
@@ -162,19 +163,25 @@ class GlintMip(GlintBSDF):
         super().__init__(props)
         parameters = Parameters(props)
         sizes = {"output_size": 4096, "patch_size": 64, "clusters": 32, "seed": 0}
-        self.pndf = Mip(
-            parameters.normal_map(),
-            **{name: parameters.whole(name, default) for name, default in sizes.items()},
-            overlap=parameters.whole("overlap", None),
-            lod_scale=parameters.number("lod_scale", 0.5),
-            balance=parameters.number("balance", 0.9),
-            sigma_r=parameters.number("sigma_r", 0.005),
-            normal_weight=parameters.number("normal_weight", 8.0),
-            owner=self.owner,
-        )
-        masking = parameters.choice("masking", "beckmann", ("beckmann", "none"))
-        self.masking = MapBeckmannMasking(self.pndf) if masking == "beckmann" else None
-        self.smooth = MapBeckmannLobe(self.pndf)
+        self.normal_map = parameters.normal_map()
+        self.options = {name: parameters.whole(name, x) for name, x in sizes.items()} | {
+            "overlap": parameters.whole("overlap", None),
+            "lod_scale": parameters.number("lod_scale", 0.5),
+            "balance": parameters.number("balance", 0.9),
+            "sigma_r": parameters.number("sigma_r", 0.005),
+            "normal_weight": parameters.number("normal_weight", 8.0),
+            "owner": self.owner,
+        }
+        self.masking_name = parameters.choice("masking", "beckmann", Mip.maskings)
+        self.finish()
+
+    def create(self, domain: Domain | None) -> Mip:
+        return Mip(self.normal_map, **self.options)
+
+    @property
+    def map_shape(self) -> MapShape:
+        size = self.options["output_size"]
+        return MapShape(size, size, self.normal_map.wrap_mode)
 
 
 mi.register_bsdf("glint_mip", lambda props: GlintMip(props))

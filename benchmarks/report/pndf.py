@@ -16,7 +16,7 @@ from _common import seconds, seconds_in_turn
 from glintbsdf import NormalMap
 from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.pndf.manifold.exact import TexelMesh
+from glintbsdf.pndf.manifold.mesh import TexelMesh
 
 from .methods import EXACT, SIGMA_R, Method, Surface
 

@@ -9,7 +9,7 @@ import pytest
 
 from glintbsdf import ParameterError
 from glintbsdf.bridge.parameters import Parameters
-from glintbsdf.microfacet.frame import Conductor, Dielectric
+from glintbsdf.microfacet.interface import Conductor, Dielectric, Mirror
 
 
 def parameters(**values) -> Parameters:
@@ -100,21 +100,21 @@ def test_tensors_of_any_type(variant):
 
 
 def test_material(variant):
-    assert parameters().fresnel() is None
-    assert parameters(material="none").fresnel() is None
+    assert isinstance(parameters().interface(), Mirror)
+    assert isinstance(parameters(material="none").interface(), Mirror)
     for preset in ("Au", "Al", "Cu"):
-        conductor = parameters(material=preset).fresnel()
+        conductor = parameters(material=preset).interface()
         expected = mi.traverse(mi.load_dict({"type": "conductor", "material": preset}))
         si = dr.zeros(mi.SurfaceInteraction3f)
         assert dr.allclose(conductor.eta.eval(si), expected["eta.value"])
         assert dr.allclose(conductor.k.eval(si), expected["k.value"])
     with pytest.raises(ParameterError, match='"material" must be one of none, Ag, Al, .*got "Fe2"'):
-        parameters(material="Fe2").fresnel()
+        parameters(material="Fe2").interface()
 
 
 def test_indices_of_refraction(variant):
     def eta(**values) -> float:
-        return parameters(**values).fresnel().eta[0]
+        return parameters(**values).interface().eta[0]
 
     assert eta(int_ior=1.5, ext_ior=1.2) == pytest.approx(1.25)
     assert eta(int_ior=2, ext_ior=1) == 2
@@ -125,21 +125,21 @@ def test_indices_of_refraction(variant):
         ParameterError,
         match='"int_ior" must be a finite number from 0.001 to 1000 or one of vacuum, .*',
     ):
-        parameters(int_ior="bk8").fresnel()
+        parameters(int_ior="bk8").interface()
 
 
 def test_eta_and_k_of_every_kind(variant):
     si = dr.zeros(mi.SurfaceInteraction3f)
-    conductor = parameters(eta=mi.ScalarColor3d(0.2, 1.5, 3.0), k=2).fresnel()
+    conductor = parameters(eta=mi.ScalarColor3d(0.2, 1.5, 3.0), k=2).interface()
     assert isinstance(conductor, Conductor)
     assert dr.allclose(conductor.eta.eval(si), [0.2, 1.5, 3.0])
     assert dr.allclose(conductor.k.eval(si), 2)
     texture = mi.load_dict(
         {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 1), 4, np.float32))}
     )
-    assert dr.allclose(parameters(eta=texture).fresnel().eta.eval(si), 4)
-    assert dr.allclose(parameters(eta=1.0).fresnel().k.eval(si), 1)  # as roughconductor
-    assert dr.allclose(parameters(k=1.0).fresnel().eta.eval(si), 0)
+    assert dr.allclose(parameters(eta=texture).interface().eta.eval(si), 4)
+    assert dr.allclose(parameters(eta=1.0).interface().k.eval(si), 1)  # as roughconductor
+    assert dr.allclose(parameters(k=1.0).interface().eta.eval(si), 0)
 
 
 def test_spectra(each_variant):
@@ -157,9 +157,6 @@ def test_spectra(each_variant):
     )
     assert np.allclose(np.array(given.specular_reflectance.eval(si)), 0.5, atol=1e-3)
     if mi.is_spectral:
-        assert np.allclose(np.array(given.fresnel.eta.eval(si)), 1.5)
-    assert isinstance(
-        Parameters(mi.Properties("glint_test")).fresnel(),
-        Conductor if mi.is_polarized else type(None),
-    )
-    assert isinstance(parameters(int_ior=1.5).fresnel(), Dielectric)
+        assert np.allclose(np.array(given.interface.eta.eval(si)), 1.5)
+    assert isinstance(Parameters(mi.Properties("glint_test")).interface(), Mirror)
+    assert isinstance(parameters(int_ior=1.5).interface(), Dielectric)

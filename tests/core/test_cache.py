@@ -49,12 +49,16 @@ def forbidden():
     raise AssertionError("built although it is in the cache")
 
 
+# Its arrays are those of Builder, as far as the cache can tell.
+forbidden.__qualname__ = Builder.__qualname__
+
+
 def test_round_trip(folder):
     builder, other = Builder(), Builder(seed=1)
-    builder.check(cache.load_or_build("lists 1 abc", builder))
-    builder.check(cache.load_or_build("lists 1 abc", forbidden))
-    other.check(cache.load_or_build("lists 1 abd", other))
-    builder.check(cache.load_or_build("lists 1 abc", forbidden))
+    builder.check(cache.load_or_build(builder, "lists 1 abc"))
+    builder.check(cache.load_or_build(forbidden, "lists 1 abc"))
+    other.check(cache.load_or_build(other, "lists 1 abd"))
+    builder.check(cache.load_or_build(forbidden, "lists 1 abc"))
     assert builder.calls == other.calls == 1
     assert sorted(path.suffix for path in folder.iterdir()) == [".npz", ".npz"]
 
@@ -64,7 +68,7 @@ def test_off(folder, monkeypatch, value):
     monkeypatch.setenv("GLINTBSDF_CACHE", value)
     builder = Builder()
     for _ in range(2):
-        builder.check(cache.load_or_build("key", builder))
+        builder.check(cache.load_or_build(builder, "key"))
     assert builder.calls == 2 and cache.directory() is None and not folder.exists()
 
 
@@ -77,7 +81,7 @@ def test_default_directory(monkeypatch):
 
 def test_damaged_file_is_built_again(folder):
     builder = Builder()
-    cache.load_or_build("key", builder)
+    cache.load_or_build(builder, "key")
     (path,) = folder.iterdir()
     content = path.read_bytes()
     damaged = [content[:length] for length in (0, 1, 4, 100, len(content) // 2, len(content) - 1)]
@@ -89,9 +93,9 @@ def test_damaged_file_is_built_again(folder):
     damaged += [b"\x93NUMPY", b"\x80\x04K\x01.", b"not a file of arrays"]
     for built_before, broken in enumerate(damaged, start=1):
         path.write_bytes(broken)
-        builder.check(cache.load_or_build("key", builder))
+        builder.check(cache.load_or_build(builder, "key"))
         assert builder.calls == built_before + 1
-        builder.check(cache.load_or_build("key", forbidden))
+        builder.check(cache.load_or_build(forbidden, "key"))
     assert list(folder.iterdir()) == [path]
 
 
@@ -101,8 +105,8 @@ def test_unwritable_directory_warns_once(tmp_path, monkeypatch):
     cache._warn_once.cache_clear()
     builder = Builder()
     with pytest.warns(UserWarning, match="builds without its cache.*GLINTBSDF_CACHE") as caught:
-        builder.check(cache.load_or_build("key", builder))
-        builder.check(cache.load_or_build("key", builder))
+        builder.check(cache.load_or_build(builder, "key"))
+        builder.check(cache.load_or_build(builder, "key"))
     assert len(caught) == 1 and builder.calls == 2
 
 
@@ -112,10 +116,10 @@ def test_unwritable_directory_warns_once(tmp_path, monkeypatch):
 )
 def test_read_only_cache_is_read(folder):
     builder = Builder()
-    cache.load_or_build("key", builder)
+    cache.load_or_build(builder, "key")
     folder.chmod(0o500)
     try:
-        builder.check(cache.load_or_build("key", forbidden))
+        builder.check(cache.load_or_build(forbidden, "key"))
     finally:
         folder.chmod(0o700)
 
@@ -130,10 +134,10 @@ def test_interrupted_write_leaves_nothing(folder, monkeypatch, error):
     builder = Builder()
     if isinstance(error, OSError):
         with pytest.warns(UserWarning, match="No space left"):
-            builder.check(cache.load_or_build("key", builder))
+            builder.check(cache.load_or_build(builder, "key"))
     else:
         with pytest.raises(KeyboardInterrupt):
-            cache.load_or_build("key", builder)
+            cache.load_or_build(builder, "key")
     assert list(folder.iterdir()) == []
 
 
@@ -142,20 +146,20 @@ def test_error_while_building_leaves_nothing(folder):
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError, match="no"):
-        cache.load_or_build("key", broken)
+        cache.load_or_build(broken, "key")
     with pytest.raises(TypeError, match="plain arrays"):
-        cache.load_or_build("key", lambda: {"objects": np.array([None])})
+        cache.load_or_build(lambda: {"objects": np.array([None])}, "key")
     assert not folder.exists() or list(folder.iterdir()) == []
 
 
 def test_old_files_go(folder, monkeypatch):
     builder = Builder()
     for i in range(3):
-        cache.load_or_build(f"key {i}", builder)
+        cache.load_or_build(builder, f"key {i}")
         (path,) = (path for path in folder.iterdir() if path.stat().st_mtime > 1e6)
         os.utime(path, (1000 + i, 1000 + i))
     size = path.stat().st_size
-    cache.load_or_build("key 0", forbidden)  # used last
+    cache.load_or_build(forbidden, "key 0")  # used last
     stale, fresh = folder / "glintbsdf-killed.tmp", folder / "glintbsdf-running.tmp"
     foreign = [folder / "mine.tmp", folder / "mine.npz"]
     for file in (stale, fresh, *foreign):
@@ -164,15 +168,15 @@ def test_old_files_go(folder, monkeypatch):
         os.utime(file, (1000, 1000))
 
     monkeypatch.setattr(cache, "LIMIT", 2.5 * size)
-    cache.load_or_build("key 3", builder)
+    cache.load_or_build(builder, "key 3")
     assert not stale.exists() and fresh.exists()
     assert len(list(folder.glob("glintbsdf-*.npz"))) == 2
-    cache.load_or_build("key 0", forbidden)
-    cache.load_or_build("key 3", forbidden)
+    cache.load_or_build(forbidden, "key 0")
+    cache.load_or_build(forbidden, "key 3")
 
     monkeypatch.setattr(cache, "LIMIT", 1)
-    cache.load_or_build("key 4", builder)
-    cache.load_or_build("key 4", forbidden)
+    cache.load_or_build(builder, "key 4")
+    cache.load_or_build(forbidden, "key 4")
     assert len(list(folder.glob("glintbsdf-*.npz"))) == 1
     assert all(file.exists() for file in foreign)
 
@@ -196,7 +200,7 @@ def hammer(seed):
     """Write and read one key over and over; any mixture of two files would show."""
     for _ in range(30):
         arrays = cache.load_or_build(
-            "shared", lambda: {name: np.full(100_000, 7.0) for name in ("first", "second")}
+            lambda: {name: np.full(100_000, 7.0) for name in ("first", "second")}, "shared"
         )
         assert all((array == 7).all() and array.size == 100_000 for array in arrays.values())
         for path in cache.directory().glob("*.npz"):
@@ -209,3 +213,15 @@ def test_processes_share_a_directory(folder):
     with context.Pool(2) as pool:
         assert pool.map(hammer, range(2)) == [0, 1]
     assert not list(folder.glob("*.tmp"))
+
+
+def test_key_changes_with_the_source_of_the_builder():
+    """A builder's digest covers the modules that it imports, and no others."""
+    from glintbsdf.pndf.manifold import exact
+
+    assert cache.source_digest(exact.__name__) == cache.source_digest(exact.__name__)
+    digests = {
+        cache.source_digest(f"glintbsdf.{module}")
+        for module in ("core.errors", "core.hashing", "footprint.lattice", "pndf.index.lists")
+    }
+    assert len(digests) == 4

@@ -1,4 +1,4 @@
-"""What is built for a reach: smaller, and within the reach the same to the last bit."""
+"""What is built for a domain: smaller, and within the domain the same to the last bit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from glintbsdf import Footprint, NormalMap, maps
-from glintbsdf.footprint.domain import Gate, Reach, Recorder, waiting
+from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.lattice import Lattice
 from glintbsdf.pndf import (
     ClusteredManifold,
@@ -54,23 +54,23 @@ def normals() -> mi.Vector2f:
     return mi.Vector2f(np.float32(0.1 * rng.standard_normal((2, COUNT))))
 
 
-def recorded(normal_map: NormalMap, footprint: Footprint, active=True) -> Reach | None:
+def recorded(normal_map: NormalMap, footprint: Footprint, active=True) -> Domain | None:
     recorder = Recorder(normal_map)
     recorder(footprint, mi.Bool(active))
     return recorder.found()
 
 
 def test_recorder_finds_what_footprints_touch(variant):
-    reach = recorded(normal_map(), footprints(sigma=2))
+    domain = recorded(normal_map(), footprints(sigma=2))
     uv, (du, dv) = footprints(sigma=2).uv.numpy(), (footprints(sigma=2).du, footprints(sigma=2).dv)
     size = np.array([[WIDTH], [HEIGHT]])
     extent = 3 * size * np.sqrt(du.numpy() ** 2 + dv.numpy() ** 2)
     first = np.floor((uv * size - 0.5 - extent).min(axis=1))
     last = np.floor((uv * size - 0.5 + extent).max(axis=1)) + 1
-    assert reach.columns == (first[0], last[0]) and reach.rows == (first[1], last[1])
+    assert domain.columns == (first[0], last[0]) and domain.rows == (first[1], last[1])
     # Random axes come near to both ends; sizes are known to a 16th of an octave.
-    assert 2 * 2 ** (-1 / 16) * 0.99 < reach.smallest <= 2.01
-    assert 7.7 < reach.largest < 8 * 2 ** (1 / 16)
+    assert 2 * 2 ** (-1 / 16) * 0.99 < domain.smallest <= 2.01
+    assert 7.7 < domain.largest < 8 * 2 ** (1 / 16)
 
 
 def test_recorder_heeds_the_active_lanes_only(variant):
@@ -106,8 +106,8 @@ def test_lists_of_a_part_of_the_map(variant, wrap_mode, centre):
     whole_map, footprint, m = normal_map(wrap_mode), footprints(centre), normals()
     complete = Manifold(whole_map)
     expected = complete.eval(m, footprint).numpy()
-    for reach in (recorded(whole_map, footprint), recorded(whole_map, footprint).widened()):
-        trimmed = Manifold(whole_map, reach=reach)
+    for domain in (recorded(whole_map, footprint), recorded(whole_map, footprint).widened()):
+        trimmed = Manifold(whole_map, domain=domain)
         assert np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
         assert trimmed.nbytes < complete.nbytes
     # Far outside of a clamped map there is one normal, which no other equals.
@@ -117,7 +117,7 @@ def test_lists_of_a_part_of_the_map(variant, wrap_mode, centre):
 @pytest.mark.parametrize("kernel", ["disk", "box"])
 def test_lists_for_other_kernels(variant, kernel):
     footprint, m = footprints(), normals()
-    trimmed = Manifold(normal_map(), kernel, reach=recorded(normal_map(), footprint))
+    trimmed = Manifold(normal_map(), kernel, domain=recorded(normal_map(), footprint))
     expected = Manifold(normal_map(), kernel).eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
 
@@ -130,7 +130,7 @@ def test_lists_for_other_kernels(variant, kernel):
 @pytest.mark.parametrize("sigma", [0.4, 3.0, 12.0])
 def test_lists_under_approximations(variant, create, sigma):
     footprint, m = footprints(sigma=sigma, spread=0.01), normals()
-    trimmed = create(normal_map(), reach=recorded(normal_map(), footprint))
+    trimmed = create(normal_map(), domain=recorded(normal_map(), footprint))
     complete = create(normal_map())
     expected = complete.eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
@@ -139,8 +139,8 @@ def test_lists_under_approximations(variant, create, sigma):
 
 def test_small_footprints_need_no_lists(variant):
     footprint, m = footprints(sigma=0.1), normals()
-    trimmed = Manifold(normal_map(), reach=recorded(normal_map(), footprint))
-    assert trimmed.parts["lists of quads"] == 0
+    trimmed = Manifold(normal_map(), domain=recorded(normal_map(), footprint))
+    assert trimmed.parts()["lists of quads"] == 0
     expected = Manifold(normal_map()).eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
 
@@ -149,7 +149,7 @@ def test_small_footprints_need_no_lists(variant):
 @pytest.mark.parametrize("step", [0.5, 1.6])
 def test_elements_under_small_footprints_need_no_lists(variant, step, sigma):
     footprint, m = footprints(sigma=sigma), normals()
-    trimmed = Elements(normal_map(), step=step, reach=recorded(normal_map(), footprint))
+    trimmed = Elements(normal_map(), step=step, domain=recorded(normal_map(), footprint))
     complete = Elements(normal_map(), step=step)
     expected = complete.eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
@@ -160,7 +160,7 @@ def test_elements_under_small_footprints_need_no_lists(variant, step, sigma):
 @pytest.mark.parametrize("method", ["lean", "toksvig", "variance"])
 def test_levels_of_a_filter(variant, method, sigma):
     footprint, m = footprints(sigma=sigma), normals()
-    trimmed = Filtered(normal_map(), method, reach=recorded(normal_map(), footprint))
+    trimmed = Filtered(normal_map(), method, domain=recorded(normal_map(), footprint))
     complete = Filtered(normal_map(), method)
     expected = complete.eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
@@ -173,7 +173,7 @@ def test_parts_of_levels(variant, wrap_mode, centre):
     """Stretched footprints look up places all along their major axes."""
     whole_map, m = normal_map(wrap_mode), normals()
     footprint = footprints(centre, sigma=0.3, stretch=20)
-    trimmed = Filtered(whole_map, "clean", reach=recorded(whole_map, footprint))
+    trimmed = Filtered(whole_map, "clean", domain=recorded(whole_map, footprint))
     complete = Filtered(whole_map, "clean")
     expected = complete.eval(m, footprint).numpy()
     assert expected.any() and np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
@@ -184,23 +184,23 @@ def test_parts_of_levels(variant, wrap_mode, centre):
 @pytest.mark.parametrize("wrap_mode", ["repeat", "clamp"])
 def test_levels_of_masking_and_of_diffuse_reflection(variant, wrap_mode, sigma):
     whole_map, footprint = normal_map(wrap_mode), footprints(sigma=sigma)
-    reach = recorded(whole_map, footprint)
+    domain = recorded(whole_map, footprint)
     mesh = Manifold(whole_map)
     w = dr.normalize(mi.Vector3f(1, 0.3, 0.2))
-    complete, trimmed = GgxFit(mesh), GgxFit(mesh, reach)
+    complete, trimmed = GgxFit(mesh), GgxFit(mesh, domain)
     expected = complete.eval(w, footprint).numpy()
     assert np.array_equal(trimmed.eval(w, footprint).numpy(), expected)
-    assert sum(trimmed.parts.values()) < sum(complete.parts.values())
+    assert sum(trimmed.parts().values()) < sum(complete.parts().values())
     query = (w, w, mi.TransportMode.Radiance, footprint, True)
     expected = OrenNayarDiffuse(mesh).eval(*query).numpy()
-    assert np.array_equal(OrenNayarDiffuse(mesh, reach).eval(*query).numpy(), expected)
+    assert np.array_equal(OrenNayarDiffuse(mesh, domain).eval(*query).numpy(), expected)
 
 
 def test_hand_over_makes_the_levels_it_needs(variant):
     footprint, m = footprints(sigma=3), normals()
-    reach = recorded(normal_map(), footprint)
+    domain = recorded(normal_map(), footprint)
     complete = HandOver(Manifold(normal_map()), 4)
-    trimmed = HandOver(Manifold(normal_map(), reach=reach), 4, reach=reach)
+    trimmed = HandOver(Manifold(normal_map(), domain=domain), 4, domain=domain)
     expected = complete.eval(m, footprint).numpy()
     assert np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
     assert trimmed.nbytes < complete.nbytes
@@ -221,15 +221,15 @@ def test_gate_lets_through_what_is_inside(variant):
     ids=["columns", "rows", "smaller", "larger"],
 )
 def test_gate_tells_what_is_outside_and_hands_on_something_inside(variant, other):
-    reach = recorded(normal_map(), footprints())
-    gate = Gate(normal_map(), reach)
+    domain = recorded(normal_map(), footprints())
+    gate = Gate(normal_map(), domain)
     through = gate(footprints(**other), mi.Bool(True))
     assert gate.missed()
     found = recorded(normal_map(), through)
-    assert reach.columns[0] <= found.columns[0] and found.columns[1] <= reach.columns[1]
-    assert reach.rows[0] <= found.rows[0] and found.rows[1] <= reach.rows[1]
+    assert domain.columns[0] <= found.columns[0] and found.columns[1] <= domain.columns[1]
+    assert domain.rows[0] <= found.rows[0] and found.rows[1] <= domain.rows[1]
     # Sizes are recorded in steps, rounded outwards.
-    assert found.smallest >= reach.smallest / 1.05 and found.largest <= reach.largest * 1.05
+    assert found.smallest >= domain.smallest / 1.05 and found.largest <= domain.largest * 1.05
 
 
 def test_gate_does_not_mind_lanes_that_ask_nothing(variant):
@@ -249,9 +249,7 @@ BSDFS = {
 def test_waiting_to_be_built(variant, plugin):
     data = mi.TensorXf(normal_map().normals)
     parameters = {"type": plugin, "data": data, "pixel_spread": 1e-3, **BSDFS[plugin]}
-    with waiting() as made:
-        bsdf = mi.load_dict(parameters)
-    assert made == [bsdf]
+    bsdf = mi.load_dict(parameters | {"deferred": True})
     ordinary = mi.load_dict(parameters)
     si = dr.zeros(mi.SurfaceInteraction3f, 64)
     si.uv = mi.Point2f(dr.linspace(mi.Float, 0.2, 0.8, 64), 0.3)
@@ -276,10 +274,3 @@ def test_waiting_to_be_built(variant, plugin):
     assert bsdf.parts() == ordinary.parts()
     values = [np.array(b.eval(mi.BSDFContext(), si, wo)[0]) for b in (bsdf, ordinary)]
     assert np.array_equal(*values) and np.ptp(values[0]) > 0
-
-
-def test_nothing_waits_outside_of_the_block(variant):
-    data = mi.TensorXf(normal_map().normals)
-    with pytest.raises(RuntimeError), waiting():
-        raise RuntimeError
-    assert mi.load_dict({"type": "glint_manifold", "data": data}).parts()

@@ -12,7 +12,9 @@ import scipy.integrate
 import scipy.stats
 
 from glintbsdf import maps
-from glintbsdf.microfacet import frame as microfacet
+from glintbsdf.microfacet import frame, fresnel, interface
+from glintbsdf.microfacet.masking import BeckmannMasking, beckmann_lambda
+from glintbsdf.pndf.base import map_alpha_squared
 
 
 def directions(count: int, seed: int) -> mi.Vector3f:
@@ -23,13 +25,13 @@ def directions(count: int, seed: int) -> mi.Vector3f:
 
 def test_half_vector_reflects(variant):
     wi, wo = directions(1000, 1), directions(1000, 2)
-    m = microfacet.half_vector(wi, wo)
+    m = frame.half_vector(wi, wo)
     assert dr.allclose(mi.reflect(wi, mi.Normal3f(m)), wo, atol=2e-6)
 
 
 def test_normal_from_projection(variant):
     s = mi.Vector2f([0, 0.6, 0.8, 1.0, 2.0], [0, 0, 0, 0, 1.0])
-    assert dr.allclose(microfacet.normal_from_projection(s).z, [1, 0.8, 0.6, 0, 0])
+    assert dr.allclose(frame.normal_from_projection(s).z, [1, 0.8, 0.6, 0, 0])
 
 
 def test_reflected_pdf_integrates_to_one(variant):
@@ -39,9 +41,9 @@ def test_reflected_pdf_integrates_to_one(variant):
     wi = dr.normalize(mi.Vector3f(0.3, 0.2, 1))
     rng = mi.PCG32(size=n)
     wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    m = microfacet.half_vector(wi, wo)
+    m = frame.half_vector(wi, wo)
     density = dr.select(m.x * m.x + m.y * m.y < radius**2, 1 / (np.pi * radius**2), 0)
-    pdf = microfacet.reflected_pdf(density * m.z, wo, m)
+    pdf = interface.Mirror().components[0].density_of_direction(density * m.z, wo, m)
     assert abs(dr.mean(pdf)[0] * 2 * np.pi - 1) < 5e-3
 
 
@@ -51,7 +53,7 @@ def test_beckmann_lambda_is_the_integral_that_defines_it(variant, alpha):
     angles = np.array([0.2, 0.8, 1.2, 1.45, 1.55, 1.57])
     phi = np.linspace(0, 3, 6)
     w = np.array([np.sin(angles) * np.cos(phi), np.sin(angles) * np.sin(phi), np.cos(angles)])
-    ours = microfacet.beckmann_lambda(mi.Vector3f(w), mi.Vector2f(np.square(alpha)))
+    ours = beckmann_lambda(mi.Vector3f(w), mi.Vector2f(np.square(alpha)))
     for theta, p, value in zip(angles, phi, np.array(ours), strict=True):
         sigma = np.hypot(alpha[0] * np.cos(p), alpha[1] * np.sin(p)) / np.sqrt(2)
         c = 1 / np.tan(theta)
@@ -64,9 +66,9 @@ def test_beckmann_lambda_is_the_integral_that_defines_it(variant, alpha):
 
 
 def test_beckmann_lambda_at_the_limits(variant):
-    assert dr.all(microfacet.beckmann_lambda(directions(100, 3), mi.Vector2f(0)) == 0)
+    assert dr.all(beckmann_lambda(directions(100, 3), mi.Vector2f(0)) == 0)
     grazing = mi.Vector3f(1, 0, [1e-3, 1e-6, 1e-30])
-    value = microfacet.beckmann_lambda(grazing, mi.Vector2f(0.01))
+    value = beckmann_lambda(grazing, mi.Vector2f(0.01))
     assert dr.all(value > 10) and dr.all(dr.isfinite(value))
 
 
@@ -74,34 +76,38 @@ def test_smith_g1_is_that_of_mitsuba(variant):
     # Mitsuba uses Walter's rational fit, 0.35 % from the exact function.
     w = directions(500, 4)
     distribution = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 0.4, 0.1)
-    g1 = dr.rcp(1 + microfacet.beckmann_lambda(w, mi.Vector2f(0.16, 0.01)))
+    g1 = dr.rcp(1 + beckmann_lambda(w, mi.Vector2f(0.16, 0.01)))
     assert dr.max(dr.abs(g1 - distribution.smith_g1(w, mi.Vector3f(0, 0, 1))))[0] < 4e-3
 
 
 def test_masking_takes_the_roughness_of_the_map(variant):
     normal_map = maps.brushed((40, 64), streak_length=30)
     pndf = SimpleNamespace(data=mi.TensorXf(normal_map.normals))
-    masking = microfacet.MapBeckmannMasking(pndf)
+    masking = BeckmannMasking(lambda: map_alpha_squared(pndf.data))
     assert np.allclose(np.sqrt(np.ravel(masking.alpha_squared)), normal_map.roughness(), rtol=1e-4)
     pndf.data = mi.TensorXf(0 * normal_map.normals)
-    masking.parameters_changed()
-    assert dr.all(masking.eval(directions(9, 5), directions(9, 6), None, True) == 1)
+    radiance = mi.TransportMode.Radiance
+    masking.parameters_changed(["pixel_spread"])
+    assert not dr.all(masking.eval(directions(9, 5), directions(9, 6), None, radiance, True) == 1)
+    masking.parameters_changed(["data"])
+    assert dr.all(masking.eval(directions(9, 5), directions(9, 6), None, radiance, True) == 1)
 
 
 def test_masking_is_differentiable_where_it_vanishes(variant):
     data = mi.TensorXf(np.zeros((2, 2, 2)))
     dr.enable_grad(data)
-    masking = microfacet.MapBeckmannMasking(SimpleNamespace(data=data))
-    dr.backward(dr.sum(masking.eval(directions(9, 5), directions(9, 6), None, True)))
+    masking = BeckmannMasking(lambda: map_alpha_squared(data))
+    radiance = mi.TransportMode.Radiance
+    dr.backward(dr.sum(masking.eval(directions(9, 5), directions(9, 6), None, radiance, True)))
     assert dr.all(dr.isfinite(dr.grad(data)), axis=None)
 
 
 def test_dielectric_is_a_conductor_without_absorption(variant):
     si = dr.zeros(mi.SurfaceInteraction3f, 50)
     cosine = dr.linspace(mi.Float, 0.01, 1, 50)
-    dielectric = microfacet.Dielectric(1.5).reflectance(cosine, si, True)
+    dielectric = interface.Dielectric(1.5).reflectance(cosine, si, True)
     eta, k = (mi.load_dict({"type": "uniform", "value": value}) for value in (1.5, 0.0))
-    conductor = microfacet.Conductor(eta, k).reflectance(cosine, si, True)
+    conductor = interface.Conductor(eta, k).reflectance(cosine, si, True)
     assert dr.allclose(dielectric, conductor, atol=1e-5)
     assert dr.allclose(dielectric.x[49], 0.04, atol=1e-6)
 
@@ -116,15 +122,15 @@ def test_mueller_matrix_is_that_of_roughconductor(each_variant):
         {"type": "glint_manifold", "data": mi.TensorXf(maps.isotropic(8).normals), "material": "Au"}
     )
     wi, wo = directions(50, 7), directions(50, 8)
-    m = microfacet.half_vector(wi, wo)
+    m = frame.half_vector(wi, wo)
     si = dr.zeros(mi.SurfaceInteraction3f, 50)
     si.wi, si.wavelengths = wi, [450, 500, 550, 650]
-    reflectance = np.array(ours.fresnel.reflectance(dr.dot(wo, m), si, True))
+    reflectance = np.array(ours.interface.reflectance(dr.dot(wo, m), si, True))
     for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
         expected = np.array(rough.eval(mi.BSDFContext(mode), si, wo))
         actual = np.array(
-            microfacet.mueller_reflection(
-                ours.fresnel.index(si, True), mi.UnpolarizedSpectrum(0.5), mode, wi, wo, m
+            fresnel.mueller_reflection(
+                ours.interface.index(si, True), mi.UnpolarizedSpectrum(0.5), mode, wi, wo, m
             )
         )
         assert np.allclose(actual[0, 0], 0.5 * reflectance, rtol=1e-4)

@@ -70,19 +70,19 @@ def image(inspected: inspection.Inspected, missed=lambda: False) -> np.ndarray:
 
 
 def test_survey_finds_what_the_sensor_sees(folder):
-    (reach,) = inspection.survey(load())
+    (domain,) = inspection.survey(load())
     # The window shows texels 56 to 72. A footprint has half the width of one of 8 × 8 strata of a
     # pixel, a 16th of a texel, as its standard deviation, and reaches three times as far.
-    for first, last in (reach.columns, reach.rows):
+    for first, last in (domain.columns, domain.rows):
         assert 55 <= first <= 56 and 71 <= last <= 73
-    assert 1 / 16 / 1.1 < reach.smallest <= 1 / 16 * 1.01
-    assert 1 / 16 * 0.99 < reach.largest < 1 / 16 * 1.1
+    assert 1 / 16 / 1.1 < domain.smallest <= 1 / 16 * 1.01
+    assert 1 / 16 * 0.99 < domain.largest < 1 / 16 * 1.1
 
 
 def test_survey_knows_the_samples_and_the_scale(folder):
-    (reach,) = inspection.survey(load(), spp=16)
+    (domain,) = inspection.survey(load(), spp=16)
     (coarse,) = inspection.survey(load(scale=4))
-    assert 1 / 8 / 1.1 < reach.smallest <= 1 / 8 * 1.01
+    assert 1 / 8 / 1.1 < domain.smallest <= 1 / 8 * 1.01
     assert 1 / 4 / 1.1 < coarse.smallest <= 1 / 4 * 1.01
 
 
@@ -132,7 +132,7 @@ def test_a_survey_that_missed_something_costs_time_only(folder, monkeypatch, par
 
     def short_sighted(*arguments) -> list:
         wrong = {"columns": (60, 62), "rows": (60, 62), "smallest": 1.0, "largest": 0.01}
-        return [replace(reach, **{part: wrong[part]}) for reach in survey(*arguments)]
+        return [replace(domain, **{part: wrong[part]}) for domain in survey(*arguments)]
 
     monkeypatch.setattr(inspection, "survey", short_sighted)
     monkeypatch.setattr("glintbsdf.footprint.domain.MARGIN_TEXELS", 0)
@@ -157,7 +157,7 @@ def test_what_no_path_meets_is_not_built(folder):
     picture = image(inspected, trimmed.missed)
     assert trimmed.sufficed and inspected.bsdfs[0].parts() == {} and np.ptp(picture) == 0
     (finding,) = inspection.inspect(load())
-    assert finding.reach is None and finding.trimmed == {} and finding.complete
+    assert finding.domain is None and finding.trimmed == {} and finding.complete
     assert "no path meets it" in str(finding) and "next to nothing" in str(finding)
 
 

@@ -6,20 +6,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.parameters import Parameters, check_to_uv
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
+from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
 from glintbsdf.core.errors import check
-from glintbsdf.footprint.domain import Gate, Reach, Recorder, must_wait
+from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
-from glintbsdf.maps.normalmap import NormalMap
-from glintbsdf.microfacet import frame as microfacet
+from glintbsdf.footprint.query import Query
+from glintbsdf.maps.normalmap import MapShape, NormalMap
+from glintbsdf.microfacet.interface import Component, Mirror
+from glintbsdf.microfacet.masking import SmithMasking
+from glintbsdf.pndf.base import PNDF
+from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
 
 #: The most that footprint_sigma and pixel_spread may be set to after loading.
 LARGEST = 1e4
@@ -28,13 +30,17 @@ LARGEST = 1e4
 class FootprintBSDF(mi.BSDF):
     """A BSDF that depends on the footprint: its parameters, and what follows from them.
 
+    A subclass's constructor reads its parameters, then calls :meth:`build` unless it is
+    ``deferred``: whoever loads the scene then builds it, for the domain that the scene asks for.
+
     Attributes:
         owner, name (str): type and id of the plugin, as errors and warnings name them.
+        deferred (bool): whether the constructor is to build nothing. The property of this name is
+            set by :func:`glintbsdf.scene.rendering.load_scene`, not by users.
         to_uv (mi.ScalarAffineTransform3f): transform of UV space.
         footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
-        normal_map (NormalMap): the map, of a BSDF that can tell what of it is asked for.
+        normal_map (NormalMap): the map as it was loaded, None without one.
         watch (Recorder | Gate): who looks at every footprint; nobody by default.
-        waits (bool): whether it was made in a block of :func:`~.waiting`.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
     """
@@ -44,8 +50,8 @@ class FootprintBSDF(mi.BSDF):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.waits = must_wait(self)
         self.owner, self.name = props.plugin_name(), props.id()
+        self.deferred = props.get("deferred", False)
         parameters = Parameters(props)
         parameters.refuse_unknown()
         self.to_uv = parameters.to_uv()
@@ -53,12 +59,14 @@ class FootprintBSDF(mi.BSDF):
         self.pixel_spread = mi.Float(parameters.number("pixel_spread", 0.0))
         self.warned_of_point_footprint = self.looked_at_surfaces = False
 
-    def build(self, reach: Reach | None = None) -> None:
-        """Make what queries within ``reach`` need, or any query; whatever there was, goes.
+    @property
+    def map_shape(self) -> MapShape | None:
+        """Size and wrap mode of the map that footprints are on; None without a map."""
+        return None if self.normal_map is None else self.normal_map.shape
 
-        A subclass that can do so late overrides this, and calls it at its constructor's end unless
-        it ``waits``. Here nothing is left to do.
-        """
+    def build(self, domain: Domain | None = None) -> None:
+        """Make what queries within ``domain`` need, or any query; whatever there was, goes."""
+        raise NotImplementedError
 
     def parts(self) -> dict[str, int]:
         """Memory of each part of what has been built, bytes."""
@@ -75,6 +83,8 @@ class FootprintBSDF(mi.BSDF):
         callback.put("pixel_spread", self.pixel_spread, flags)
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
+        if not keys or "to_uv" in keys:
+            check_to_uv(self.owner, self.to_uv)
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):
             value = getattr(self, key)
             # Passes of a rendering take pixel_spread beyond the range of its declaration.
@@ -132,6 +142,10 @@ class FootprintBSDF(mi.BSDF):
         if doubt:
             mi.Log(mi.LogLevel.Warn, f'{self.owner} "{self.name}": {doubt}')
 
+    def query(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Query:
+        """All that an evaluation at ``si`` asks of the P-NDF; made once for each."""
+        return Query(self.footprint(si, active))
+
     def warn_of_point_footprint(self) -> None:
         """Say, once, that nothing tells how large a pixel is, and why."""
         if self.warned_of_point_footprint:
@@ -173,68 +187,74 @@ class FootprintBSDF(mi.BSDF):
         return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
 
 
-class Facets(NamedTuple):
-    """What a glint BSDF reflects from: its glints, or the smooth lobe that stands for them.
-
-    Attributes:
-        density: the function ``(si, m, footprint, active)`` that gives D of the unit normal m.
-        normals: what normals are drawn from, see :class:`~.PndfNormals`.
-        masking: :class:`~.SmithMasking`, or None for none.
-        tint: the function ``(si, active)`` that gives the factor on the reflection.
-    """
-
-    density: Callable
-    normals: object
-    masking: microfacet.SmithMasking | None
-    tint: Callable
-
-
 class GlintBSDF(FootprintBSDF):
     """A one-sided glossy BRDF, ``F D G / (4 cosθ_i cosθ_o)``, with D the P-NDF of a footprint.
 
     The base class reads the parameters that all glint BSDFs share and implements Mitsuba's
-    interface once. A subclass's constructor calls this one, reads its own parameters, and sets
+    interface once. A subclass reads its own parameters in its constructor, which ends with
+    :meth:`finish`, and says in :meth:`create` how its P-NDF is made.
 
     Attributes:
-        pndf: the P-NDF: ``eval(m, footprint, active)``, the density D over the disk of projected
-            normals; ``traverse`` and ``parameters_changed``. None as long as it waits to be built:
-            a smooth surface of the map's overall roughness then takes its place.
-        masking: :class:`~.SmithMasking`, or None for none.
-        smooth: :class:`~.BeckmannLobe` of the roughness that all glints have
-            together, which takes their place in a ``separation.smooth_context()``; None (the
-            default) where the P-NDF is smooth by itself.
-
-    Normals are drawn by the P-NDF's ``sample(footprint, sample1, sample2, active)``, from exactly
-    its density. A subclass whose P-NDF cannot do that overrides :meth:`normals`; one whose density
-    has colours overrides :meth:`density`.
+        pndf (PNDF): the P-NDF. None as long as nothing is built: a smooth surface of the map's
+            overall roughness then takes its place.
+        masking (SmithMasking): of the P-NDF's facets; None for none.
+        smooth (PNDF): what all glints add up to, which takes their place in a
+            ``separation.smooth_context()``; None where the P-NDF is smooth by itself.
+        smooth_masking (SmithMasking): of the facets of ``smooth``.
+        interface (Interface): what happens at a facet.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
     """
 
-    pndf: object = None
-    masking: microfacet.SmithMasking | None = None
-    smooth: microfacet.BeckmannLobe | None = None
+    pndf: PNDF | None = None
+    masking: SmithMasking | None = None
+    smooth: PNDF | None = None
+    smooth_masking: SmithMasking | None = None
+    masking_name = "none"
+    height_correlated = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
-        self.fresnel = parameters.fresnel()
+        self.interface = parameters.interface()
         self.specular_reflectance = parameters.specular_reflectance()
-
-        self.m_flags = (
-            mi.BSDFFlags.GlossyReflection
+        self.color_conversion: ColorConversion | None = None
+        self.m_components = [
+            component.flags
             | mi.BSDFFlags.FrontSide
             | mi.BSDFFlags.SpatiallyVarying
             | mi.BSDFFlags.Anisotropic
-        )
-        self.m_components = [self.m_flags]
+            for component in self.interface.components
+        ]
+        self.m_flags = self.m_components[0]
+        for flags in self.m_components[1:]:
+            self.m_flags |= flags
+
+    def create(self, domain: Domain | None) -> PNDF:
+        """Make the P-NDF for queries within ``domain``, or for any."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """End of a subclass's constructor: build, unless somebody else will."""
+        if not self.deferred:
+            self.build()
+        elif self.normal_map is not None:
+            alpha = [max(alpha, MIN_ALPHA) for alpha in self.normal_map.roughness()]
+            self.smooth = SmoothBeckmann(lambda: mi.Vector2f(*alpha), owner=self.owner)
+            self.smooth_masking = self.smooth.masking("beckmann", False)
+
+    def build(self, domain: Domain | None = None) -> None:
+        self.pndf = self.create(domain)
+        self.masking = self.pndf.masking(self.masking_name, self.height_correlated)
+        self.smooth = self.pndf.smooth()
+        self.smooth_masking = self.smooth and self.smooth.masking("beckmann", False)
+        self.color_conversion = None if self.pndf.colors is None else ColorConversion()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         if self.pndf is not None:
             self.pndf.traverse(callback)
         super().traverse(callback)
-        if self.fresnel is not None:
-            self.fresnel.traverse(callback)
+        self.interface.traverse(callback)
         if self.specular_reflectance is not None:
             callback.put(
                 "specular_reflectance", self.specular_reflectance, mi.ParamFlags.Differentiable
@@ -242,21 +262,28 @@ class GlintBSDF(FootprintBSDF):
 
     def parameters_changed(self, keys: list[str] = ()) -> None:
         super().parameters_changed(keys)
-        if self.pndf is not None:
-            self.pndf.parameters_changed(keys)
-        for part in (self.masking, self.smooth):
+        for part in (self.pndf, self.masking, self.smooth, self.smooth_masking):
             if part is not None:
-                part.parameters_changed()
+                part.parameters_changed(keys)
 
-    def facets(self, ctx: mi.BSDFContext) -> Facets:
-        """The glints, or their smooth counterpart where ``ctx`` asks for it."""
-        smooth = self.smooth if asks_for_smooth_lobes(ctx) else None
-        if self.pndf is None:
-            alpha = (max(alpha, 1e-4) for alpha in self.normal_map.roughness())
-            smooth = microfacet.BeckmannLobe(mi.Vector2f(*alpha))
-        if smooth is not None:
-            return Facets(smooth.density, smooth.normals, smooth.masking, self.mean_tint)
-        return Facets(self.density, self.normals(), self.masking, self.tint)
+    # ----------------------------------------------------------------------------------------------
+    #  Mitsuba's interface
+    # ----------------------------------------------------------------------------------------------
+
+    def facets(self, ctx: mi.BSDFContext) -> tuple[PNDF, SmithMasking | None]:
+        """The facets that reflect, and their masking: the glints, or their smooth counterpart where
+        ``ctx`` asks for it."""
+        if self.pndf is None or (self.smooth is not None and asks_for_smooth_lobes(ctx)):
+            return self.smooth, self.smooth_masking
+        return self.pndf, self.masking
+
+    def components(self, ctx: mi.BSDFContext) -> list[tuple[int, Component]]:
+        """The components that ``ctx`` asks for, with their indices."""
+        return [
+            (index, component)
+            for index, component in enumerate(self.interface.components)
+            if ctx.is_enabled(component.flags, index)
+        ]
 
     def sample(
         self,
@@ -267,30 +294,33 @@ class GlintBSDF(FootprintBSDF):
         active: mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         bs = dr.zeros(mi.BSDFSample3f)
-        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
+        components = self.components(ctx)
+        if not components:
             return bs, mi.Spectrum(0)
-        active, wi = microfacet.above_horizon(active, si.wi)
+        ((index, component),) = components
+        active, wi = component.above_horizon(active, si.wi)
 
-        # Draw a normal and reflect about it. One that does not point up, or reflects below the
-        # horizon, is an invalid sample: its mass is missing from the pdf as well.
-        footprint = self.footprint(si, active)
-        facets = self.facets(ctx)
-        m = facets.normals.sample(wi, footprint, sample1, sample2, active)
-        wo = mi.reflect(wi, mi.Normal3f(m))
-        active &= (m.z > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-        density = facets.density(si, m, footprint, active)
-        pdf = facets.normals.pdf(wi, m, density, footprint, active)
+        # Draw a normal and scatter at it. One that does not point up, or scatters to the wrong side
+        # of the surface, is an invalid sample: its mass is missing from the pdf as well.
+        query = self.query(si, active)
+        pndf, masking = self.facets(ctx)
+        m = pndf.sample_visible(wi, query, sample1, sample2, active)
+        wo, active = component.scattered(wi, m, active)
+        density = self.density(pndf, m, query, si, active)
+        pdf = pndf.visible_pdf(wi, m, density, query, active)
         active &= pdf > 0
 
         bs.wo = wo
-        bs.pdf = dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0)
-        bs.eta = 1
-        bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-        bs.sampled_component = 0
+        bs.pdf = dr.select(active, component.density_of_direction(pdf, wo, m), 0)
+        bs.eta = component.eta
+        bs.sampled_type = mi.UInt32(+component.flags)
+        bs.sampled_component = index
 
-        value = microfacet.reflected_value(density, wi.z)
-        weight = value / dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 1)
-        return bs, self.reflected(weight, facets, ctx, si, wi, wo, m, footprint, active)
+        value = component.value(density, wi.z)
+        weight = value / dr.select(active, component.density_of_direction(pdf, wo, m), 1)
+        return bs, self.scattered(
+            weight, component, pndf, masking, ctx, si, wi, wo, m, query, active
+        )
 
     def eval_pdf(
         self,
@@ -299,24 +329,39 @@ class GlintBSDF(FootprintBSDF):
         wo: mi.Vector3f,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection):
-            return mi.Spectrum(0), mi.Float(0)
-        active, wi, wo = microfacet.above_horizon(active, si.wi, wo)
-        m = microfacet.half_vector(wi, wo)
-        footprint = self.footprint(si, active)
-        facets = self.facets(ctx)
-        density = facets.density(si, m, footprint, active)
-        value = microfacet.reflected_value(density, wi.z)
-        pdf = facets.normals.pdf(wi, m, density, footprint, active)
+        value, pdf = mi.Spectrum(0), mi.Float(0)
+        for count, (_, component) in enumerate(self.components(ctx)):
+            of_component = self.eval_pdf_component(component, ctx, si, wo, active)
+            value, pdf = (
+                of_component if count == 0 else (value + of_component[0], pdf + of_component[1])
+            )
+        return value, pdf
+
+    def eval_pdf_component(
+        self,
+        component: Component,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        wo: mi.Vector3f,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        """``eval_pdf`` of one component."""
+        active, wi, wo = component.above_horizon(active, si.wi, wo)
+        m = component.half_vector(wi, wo)
+        query = self.query(si, active)
+        pndf, masking = self.facets(ctx)
+        density = self.density(pndf, m, query, si, active)
+        value = component.value(density, wi.z)
+        pdf = pndf.visible_pdf(wi, m, density, query, active)
         return (
-            self.reflected(value, facets, ctx, si, wi, wo, m, footprint, active),
-            dr.select(active, microfacet.reflected_pdf(pdf, wo, m), 0),
+            self.scattered(value, component, pndf, masking, ctx, si, wi, wo, m, query, active),
+            dr.select(active, component.density_of_direction(pdf, wo, m), 0),
         )
 
     def eval_diffuse_reflectance(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool = True
     ) -> mi.Spectrum:
-        """The albedo for denoisers: tint and Fresnel reflectance of the macroscopic surface.
+        """The albedo for denoisers: tint and reflectance of the macroscopic surface.
 
         Mitsuba's default, ``π`` times a value of the BRDF, would be the very glints that an albedo
         image must be free of.
@@ -324,21 +369,29 @@ class GlintBSDF(FootprintBSDF):
         cos_theta_i = mi.Frame3f.cos_theta(si.wi)
         active = mi.Bool(active) & (cos_theta_i > 0)
         albedo = self.mean_tint(si, active)
-        if self.fresnel is not None:
+        if not isinstance(self.interface, Mirror):
             cos_theta_i = dr.select(active, cos_theta_i, 1)
-            albedo = albedo * self.fresnel.reflectance(cos_theta_i, si, active)
+            albedo = albedo * self.interface.reflectance(cos_theta_i, si, active)
         albedo = dr.select(active, albedo, 0)
         return mi.mueller.depolarizer(albedo) if mi.is_polarized else albedo
 
+    # ----------------------------------------------------------------------------------------------
+    #  The parts of a value
+    # ----------------------------------------------------------------------------------------------
+
     def density(
-        self, si: mi.SurfaceInteraction3f, m: mi.Vector3f, footprint: Footprint, active: mi.Bool
+        self,
+        pndf: PNDF,
+        m: mi.Vector3f,
+        query: Query,
+        si: mi.SurfaceInteraction3f,
+        active: mi.Bool,
     ) -> mi.Float | mi.UnpolarizedSpectrum:
         """D of the unit normal ``m``: one number, or one per channel for a P-NDF with colours."""
-        return self.pndf.eval(mi.Vector2f(m.x, m.y), footprint, active)
-
-    def normals(self) -> microfacet.PndfNormals:
-        """What normals are drawn from: an object with the methods of ``PndfNormals``."""
-        return microfacet.PndfNormals(self.pndf)
+        density = pndf.eval_normal(m, query, active)
+        if pndf.colors is None or self.color_conversion is None:
+            return density
+        return self.color_conversion.eval(density, si, active)
 
     def tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """``specular_reflectance`` at ``si``."""
@@ -348,55 +401,61 @@ class GlintBSDF(FootprintBSDF):
 
     def mean_tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """What tints the surface as seen from afar, where the P-NDF may have colours of its own."""
-        return self.tint(si, active)
+        tint = self.tint(si, active)
+        if self.pndf is None:
+            return tint
+        if self.pndf.intensity is not None:
+            tint = self.pndf.intensity * tint
+        if self.color_conversion is not None:
+            mean = mi.Color3f(*self.pndf.colors.mean)
+            tint = tint * self.color_conversion.eval(mean, si, active)
+        return tint
 
-    def reflected(
+    def scattered(
         self,
         value: mi.Float | mi.UnpolarizedSpectrum,
-        facets: Facets,
+        component: Component,
+        pndf: PNDF,
+        masking: SmithMasking | None,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wi: mi.Vector3f,
         wo: mi.Vector3f,
         m: mi.Vector3f,
-        footprint: Footprint,
+        query: Query,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """``value`` times masking, tint and Fresnel reflectance or Mueller matrix, where active."""
-        if facets.masking is not None:
-            value = value * facets.masking.eval(wi, wo, footprint, active)
-        tint = facets.tint(si, active)
-        if mi.is_polarized:
-            spectrum = microfacet.mueller_reflection(
-                self.fresnel.index(si, active), value * tint, ctx.mode, wi, wo, m
-            )
-        else:
-            spectrum = value * tint
-            if self.fresnel is not None:
-                spectrum = spectrum * self.fresnel.reflectance(dr.dot(wo, m), si, active)
+        """``value`` times masking, tint, and what the facet lets through, where active."""
+        if masking is not None:
+            value = value * masking.eval(wi, wo, query, ctx.mode, active)
+        tint = self.tint(si, active) if pndf is self.pndf else self.mean_tint(si, active)
+        spectrum = component.throughput(value * tint, ctx.mode, si, wi, wo, m, active)
         return dr.select(active, spectrum, 0)
+
+    # ----------------------------------------------------------------------------------------------
+    #  In words
+    # ----------------------------------------------------------------------------------------------
 
     def parts(self) -> dict[str, int]:
         if self.pndf is None:
             return {}
-        parts = dict(getattr(self.pndf, "parts", {"P-NDF": self.pndf.nbytes}))
-        if self.pndf.nbytes > sum(parts.values()):
-            parts["else"] = self.pndf.nbytes - sum(parts.values())
-        return parts | getattr(self.masking, "parts", {})
+        return self.pndf.parts() | (self.masking.parts() if self.masking is not None else {})
 
     def left_out(self) -> list[str]:
         features = {
-            "masking: none": self.masking,
-            "Fresnel reflectance: a perfect mirror": self.fresnel,
-            "tint: no specular_reflectance": self.specular_reflectance,
+            "masking: none": self.masking_name != "none",
+            "Fresnel reflectance: a perfect mirror": not isinstance(self.interface, Mirror),
+            "tint: no specular_reflectance": self.specular_reflectance is not None,
         }
-        return [name for name, feature in features.items() if feature is None]
+        own = [] if self.pndf is None else self.pndf.left_out()
+        return own + [name for name, present in features.items() if not present]
 
     def members(self) -> dict[str, object]:
+        mirror = isinstance(self.interface, Mirror)
         return {
             "pndf": self.pndf,
             "masking": self.masking,
-            "fresnel": self.fresnel,
+            "interface": None if mirror else self.interface,
             "specular_reflectance": self.specular_reflectance,
             **super().members(),
         }

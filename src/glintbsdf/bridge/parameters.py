@@ -28,7 +28,7 @@ import numpy as np
 
 from glintbsdf.core.errors import ParameterError, check, check_choice
 from glintbsdf.maps.normalmap import ENCODINGS, MAP_TYPES, WRAP_MODES, NormalMap
-from glintbsdf.microfacet.frame import Conductor, Dielectric
+from glintbsdf.microfacet.interface import Conductor, Dielectric, Interface, Mirror
 
 MAP_SOURCES = ("filename", "bitmap", "data")
 
@@ -197,7 +197,7 @@ class Parameters:
         if known is None:
             return
         for name in self.props.keys():
-            if name not in known:
+            if name not in known and name != "deferred":  # which is set by who loads a scene
                 alike = get_close_matches(name, known, 1, 0.6)
                 hint = f', did you mean "{alike[0]}"?' if alike else f": it has {', '.join(known)}"
                 raise ParameterError(f'{self.owner}: "{name}" is not a parameter{hint}')
@@ -316,16 +316,7 @@ class Parameters:
             value,
         )
         to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)
-        matrix = to_uv.matrix
-        determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        entries = [matrix[row, column] for row in range(2) for column in range(3)]
-        check(
-            all(map(isfinite, entries)) and determinant != 0,
-            self.owner,
-            "to_uv",
-            "a finite, invertible transform of the UV plane",
-            entries,
-        )
+        check_to_uv(self.owner, to_uv)
         return to_uv
 
     # ----------------------------------------------------------------------------------------------
@@ -370,13 +361,9 @@ class Parameters:
     #  The material
     # ----------------------------------------------------------------------------------------------
 
-    def fresnel(self) -> Conductor | Dielectric | None:
-        """Reflectance from ``material``, or ``eta`` and ``k``, or ``int_ior`` and ``ext_ior``.
-
-        None for a perfect mirror, the default, which needs no code. In polarised variants a mirror
-        is the conductor of ``roughconductor``'s default (eta = 0, k = 1), which reflects everything
-        and has a Mueller matrix.
-        """
+    def interface(self) -> Interface:
+        """What facets are made of, from ``material``, or ``eta`` and ``k``, or ``int_ior`` and
+        ``ext_ior``; a perfect mirror, the default, needs no code."""
         self.only_one_of(("material",), ("eta", "k"), ("int_ior", "ext_ior"))
         props = self.props
         if "int_ior" in props or "ext_ior" in props:
@@ -388,9 +375,7 @@ class Parameters:
         check(isinstance(material, str), self.owner, "material", "a string", material)
         if material != "none":
             return Conductor(*self.conductor_preset(material))
-        if mi.is_polarized:
-            return Conductor(uniform_texture(0.0), uniform_texture(1.0))
-        return None
+        return Mirror()
 
     def specular_reflectance(self) -> mi.Texture | None:
         """The tint, in [0, 1], or None where none is given, which needs no code."""
@@ -462,6 +447,15 @@ class Parameters:
         return found["eta"], found["k"]
 
 
-def uniform_texture(value: float) -> mi.Texture:
-    """A texture of one value everywhere and at every wavelength."""
-    return mi.load_dict({"type": "uniform", "value": value})
+def check_to_uv(owner: str, to_uv: mi.ScalarAffineTransform3f) -> None:
+    """Refuse a transform of the UV plane that is not finite or not invertible."""
+    matrix = to_uv.matrix
+    entries = [float(matrix[row, column]) for row in range(2) for column in range(3)]
+    determinant = entries[0] * entries[4] - entries[1] * entries[3]
+    check(
+        all(map(isfinite, entries)) and determinant != 0,
+        owner,
+        "to_uv",
+        "a finite, invertible transform of the UV plane",
+        entries,
+    )

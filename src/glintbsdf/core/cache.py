@@ -14,13 +14,16 @@ import contextlib
 import functools
 import hashlib
 import os
+import re
+import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+
+from glintbsdf.core.errors import warn
 
 LIMIT = 4 << 30  # bytes
 _PREFIX = "glintbsdf-"  # the directory may hold files of others, which are never touched
@@ -37,22 +40,62 @@ def directory() -> Path | None:
     return None if value in ("", "off") else Path(value).expanduser()
 
 
-def load_or_build(key: str, build: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return the arrays stored under ``key``, or call ``build`` and store what it returns.
+def load_or_build(
+    build: Callable[[], Mapping[str, np.ndarray]], *content: object
+) -> dict[str, np.ndarray]:
+    """Return the arrays that ``build()`` makes of this content, from the cache if it knows them.
 
-    ``key`` must hold all that decides the result: what is built, the version of its format, the
-    map's content hash and every parameter. A cache that cannot be read or written costs one warning
-    and no more; an error in ``build`` is passed on.
+    The key is made of ``content``, which must hold all that decides the result: a map's content
+    hash and every parameter, as values whose ``repr`` tells them apart. The name of ``build`` and
+    the source of its module, and of the modules of this package that it imports, are added here: a
+    change of the builder forgets what the former one has made. A cache that cannot be read or
+    written costs one warning and no more; an error in ``build`` is passed on.
     """
     folder = directory()
     if folder is None:
         return dict(build())
+    name = getattr(build, "__qualname__", type(build).__qualname__)
+    key = f"{build.__module__}.{name} {source_digest(build.__module__)} {content!r}"
     path = folder / f"{_PREFIX}{hashlib.blake2b(key.encode(), digest_size=20).hexdigest()}.npz"
     arrays = _load(path)
     if arrays is None:
         arrays = dict(build())
         _store(path, arrays)
     return arrays
+
+
+@functools.cache
+def source_digest(module: str) -> str:
+    """A digest of the source of a module and of all modules of this package that it imports."""
+    digest = hashlib.blake2b(digest_size=16)
+    waiting, found = [module], {module}
+    while waiting:
+        path = _source_file(waiting.pop())
+        if path is None:
+            continue
+        source = path.read_bytes()
+        digest.update(source)
+        for base, names in _IMPORT.findall(source.decode()):
+            for other in (base, *(f"{base}.{name}" for name in re.findall(r"\w+", names))):
+                if other not in found:
+                    found.add(other)
+                    waiting.append(other)
+    return digest.hexdigest()
+
+
+def _source_file(module: str) -> Path | None:
+    """The source of a module of this package, or of one that is loaded; None if there is none."""
+    package, _, rest = module.partition(".")
+    if package != __name__.partition(".")[0]:
+        name = getattr(sys.modules.get(module), "__file__", None)
+        return Path(name) if name else None
+    path = Path(__file__).parents[1].joinpath(*filter(None, rest.split(".")))
+    candidates = (path.with_suffix(".py"), path / "__init__.py")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+#: Import statements of this package: ``from MODULE import NAMES``.
+_IMPORT = re.compile(r"^\s*from (glintbsdf[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
 def _load(path: Path) -> dict[str, np.ndarray] | None:
@@ -116,8 +159,7 @@ def _tidy(folder: Path) -> None:
 
 @functools.cache
 def _warn_once(folder: str, error: str) -> None:
-    warnings.warn(
+    warn(
         f"glintbsdf builds without its cache, because {folder} cannot be written "
-        f"({error}). Name another directory in GLINTBSDF_CACHE, or set it to off.",
-        stacklevel=4,
+        f"({error}). Name another directory in GLINTBSDF_CACHE, or set it to off."
     )

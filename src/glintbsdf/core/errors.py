@@ -5,6 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 
+def warn(message: str) -> None:
+    """Tell the user something through Mitsuba's log, the one channel for all warnings."""
+    import mitsuba as mi
+
+    mi.Log(mi.LogLevel.Warn, message)
+
+
 class ParameterError(ValueError):
     """A parameter of a plugin or function has a value that is not allowed."""
 

@@ -1,14 +1,12 @@
 """What a scene asks of a normal map: how much of it, and under which footprints.
 
 A :class:`Recorder` in a BSDF notes what all queries of a rendering touch; what it has found is a
-:class:`Reach`. Estimators that are given one build no more than it needs. A :class:`Gate` in a BSDF
+:class:`Domain`. P-NDFs that are given one build no more than it needs. A :class:`Gate` in a BSDF
 then sees to it that they are asked for nothing else, and says if anybody has tried.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,18 +16,18 @@ import mitsuba as mi
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import REACH, TexelKernel
 from glintbsdf.footprint.lattice import floor_int
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import MapShape
 
 #: Sizes of footprints are recorded as logarithms, in this many steps per octave.
 STEPS = 16
 
-#: Margin that :meth:`Reach.widened` adds: texels on each side, and a factor on sizes. A survey of
+#: Margin that :meth:`Domain.widened` adds: texels on each side, and a factor on sizes. A survey of
 #: some hundred thousand queries stands for a rendering of some millions.
 MARGIN_TEXELS, MARGIN_SIZE = 8, 1.25
 
 
 @dataclass(frozen=True)
-class Reach:
+class Domain:
     """What queries touch of a map.
 
     Attributes:
@@ -47,50 +45,20 @@ class Reach:
 
     @property
     def most_quads(self) -> float:
-        """Bounds ``TexelKernel.touched_quads`` of any footprint within the reach."""
+        """Bounds ``TexelKernel.touched_quads`` of any footprint within the domain."""
         return (2 * max(REACH.values()) * self.largest + 1) ** 2
 
-    def widened(self) -> Reach:
+    def widened(self) -> Domain:
         """With a margin, for what a survey may have missed."""
         columns, rows = (
             (first - MARGIN_TEXELS, last + MARGIN_TEXELS)
             for first, last in (self.columns, self.rows)
         )
-        return Reach(columns, rows, self.smallest / MARGIN_SIZE, self.largest * MARGIN_SIZE)
+        return Domain(columns, rows, self.smallest / MARGIN_SIZE, self.largest * MARGIN_SIZE)
 
 
-#: The reach of a map that nobody asks.
-NOTHING = Reach(columns=(0, -1), rows=(0, -1), smallest=0.0, largest=0.0)
-
-
-# ------------------------------------------------------------------------------------------------
-#  Building later
-# ------------------------------------------------------------------------------------------------
-
-_waiting: list | None = None
-
-
-@contextmanager
-def waiting() -> Iterator[list]:
-    """BSDFs made in this block build nothing until their ``build(reach)`` is called.
-
-    Yields the list of them, in the order in which Mitsuba makes them. Until then they reflect as a
-    smooth surface of the map's overall roughness. Some cannot wait: their ``build`` does nothing.
-    """
-    global _waiting
-    _waiting = []
-    try:
-        yield _waiting
-    finally:
-        _waiting = None
-
-
-def must_wait(bsdf: object) -> bool:
-    """Whether a new BSDF is not to build yet, and so is entered in the list of :func:`waiting`."""
-    if _waiting is None:
-        return False
-    _waiting.append(bsdf)
-    return True
+#: The domain of a map that nobody asks.
+NOTHING = Domain(columns=(0, -1), rows=(0, -1), smallest=0.0, largest=0.0)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -110,11 +78,9 @@ class Extent(NamedTuple):
     major: mi.Float
 
 
-def extent(footprint: Footprint, normal_map: NormalMap) -> Extent:
+def extent(footprint: Footprint, shape: MapShape) -> Extent:
     """What a footprint touches, with the widest of all kernels."""
-    kernel = TexelKernel(
-        "gaussian", footprint, normal_map.height, normal_map.width, normal_map.wrap_mode
-    )
+    kernel = TexelKernel("gaussian", footprint, shape.height, shape.width, shape.wrap_mode)
     mean = kernel.mean
     both = dr.square(kernel.sigma_u) + dr.square(kernel.sigma_v)
     return Extent(
@@ -131,20 +97,20 @@ class Recorder:
     """Notes what queries touch; ``footprint = recorder(footprint, active)`` in a BSDF.
 
     Args:
-        normal_map (NormalMap): the map that is asked.
+        shape (MapShape): of the map that is asked.
     """
 
     NEVER = -(1 << 30)
 
-    def __init__(self, normal_map: NormalMap) -> None:
-        self.normal_map = normal_map
+    def __init__(self, shape: MapShape) -> None:
+        self.shape = shape
         self.largest = dr.full(mi.Int, self.NEVER, 6)
         dr.make_opaque(self.largest)
 
     def __call__(self, footprint: Footprint, active: mi.Bool) -> Footprint:
         """Note the footprint, and return it."""
         with dr.suspend_grad():
-            e = extent(footprint, self.normal_map)
+            e = extent(footprint, self.shape)
             minor, major = (STEPS * dr.log2(size) for size in (e.minor, e.major))
             noted = (-e.left, e.right, -e.top, e.bottom, -floor_int(minor), floor_int(major) + 1)
             for index, value in enumerate(noted):
@@ -153,53 +119,53 @@ class Recorder:
                 )
         return footprint
 
-    def found(self) -> Reach | None:
+    def found(self) -> Domain | None:
         """What all queries together have touched; None if there was none."""
         left, right, top, bottom, minor, major = (int(x) for x in self.largest.numpy())
         if right == self.NEVER:
             return None
-        return Reach((-left, right), (-top, bottom), 2 ** (-minor / STEPS), 2 ** (major / STEPS))
+        return Domain((-left, right), (-top, bottom), 2 ** (-minor / STEPS), 2 ** (major / STEPS))
 
 
 class Gate:
-    """Lets through what lies within a reach; ``footprint = gate(footprint, active)`` in a BSDF.
+    """Lets through what lies within a domain; ``footprint = gate(footprint, active)`` in a BSDF.
 
     In place of another footprint comes one that the estimator can answer, whatever it may say: the
     rendering is then worth nothing, and :meth:`missed` tells so.
 
     Args:
-        normal_map (NormalMap): the map that is asked.
-        reach (Reach): what may be asked.
+        shape (MapShape): of the map that is asked.
+        domain (Domain): what may be asked.
     """
 
-    def __init__(self, normal_map: NormalMap, reach: Reach) -> None:
-        self.normal_map, self.reach = normal_map, reach
+    def __init__(self, shape: MapShape, domain: Domain) -> None:
+        self.shape, self.domain = shape, domain
         self.misses = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self.misses)
 
     def __call__(self, footprint: Footprint, active: mi.Bool) -> Footprint:
         """The footprint, or another."""
-        reach = self.reach
+        domain = self.domain
         with dr.suspend_grad():
-            e = extent(footprint, self.normal_map)
+            e = extent(footprint, self.shape)
             inside = (
-                (e.left >= reach.columns[0])
-                & (e.right <= reach.columns[1])
-                & (e.top >= reach.rows[0])
-                & (e.bottom <= reach.rows[1])
-                & (e.minor >= reach.smallest)
-                & (e.major <= reach.largest)
+                (e.left >= domain.columns[0])
+                & (e.right <= domain.columns[1])
+                & (e.top >= domain.rows[0])
+                & (e.bottom <= domain.rows[1])
+                & (e.minor >= domain.smallest)
+                & (e.major <= domain.largest)
             )
             dr.scatter(self.misses, mi.UInt32(1), mi.UInt32(0), active & ~inside)
         # The smallest footprint there is, in the middle: where there was any, it fits in.
-        width, height = self.normal_map.width, self.normal_map.height
+        width, height = self.shape.width, self.shape.height
         middle = mi.Point2f(
-            (sum(reach.columns) + 1) / (2 * width), (sum(reach.rows) + 1) / (2 * height)
+            (sum(domain.columns) + 1) / (2 * width), (sum(domain.rows) + 1) / (2 * height)
         )
         return Footprint(
             dr.select(inside, footprint.uv, middle),
-            dr.select(inside, footprint.du, mi.Vector2f(reach.smallest / width, 0)),
-            dr.select(inside, footprint.dv, mi.Vector2f(0, reach.smallest / height)),
+            dr.select(inside, footprint.du, mi.Vector2f(domain.smallest / width, 0)),
+            dr.select(inside, footprint.dv, mi.Vector2f(0, domain.smallest / height)),
         )
 
     def missed(self) -> bool:

@@ -24,7 +24,7 @@ import hashlib
 import logging
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +53,14 @@ _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
 
 #: The curl of normals says that green points the other way where it is so many times less then.
 _DECISIVE = 4
+
+
+class MapShape(NamedTuple):
+    """How large a map is, and what lies beyond its border: all that footprints need to know."""
+
+    height: int
+    width: int
+    wrap_mode: str
 
 
 class NormalMap:
@@ -255,6 +263,16 @@ class NormalMap:
     def width(self) -> int:
         """Number of columns (texels along u)."""
         return self.normals.shape[1]
+
+    @property
+    def shape(self) -> MapShape:
+        """Size and wrap mode."""
+        return MapShape(self.height, self.width, self.wrap_mode)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the normals, bytes."""
+        return self.normals.nbytes
 
     @cached_property
     def content_hash(self) -> str:

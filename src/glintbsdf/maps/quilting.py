@@ -30,9 +30,6 @@ REUSE = 24
 #: Cells up to which patches may not repeat what others show.
 APART = 2
 
-#: Of the maps that come of the same parameters; part of the keys of caches.
-VERSION = 3
-
 #: What the owner of a texel in an overlap is called: the cell before in x, in y, or both.
 BEFORE_X, BEFORE_Y = 1, 2
 

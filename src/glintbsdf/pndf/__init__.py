@@ -1,5 +1,6 @@
-"""Estimators of the P-NDF, the distribution of normals seen through a footprint."""
+"""P-NDFs: estimators of the distribution of normals seen through a footprint."""
 
+from glintbsdf.pndf.base import PNDF, methods, register
 from glintbsdf.pndf.elements.elements import Elements
 from glintbsdf.pndf.elements.flakes import Flakes
 from glintbsdf.pndf.filters.filters import Filtered
@@ -20,4 +21,7 @@ __all__ = [
     "Manifold",
     "Mip",
     "TabulatedManifold",
+    "PNDF",
+    "methods",
+    "register",
 ]

@@ -2,7 +2,7 @@
 
 A survey renders the scene with few samples and notes the part of each map and the footprints that
 its BSDF is asked for, along whole paths, by the scene's own sensor and integrator. The BSDFs are
-then built for these, and a margin (``reach.py``). Within them a trimmed BSDF answers as a complete
+then built for these, and a margin (``domain.py``). Within them a trimmed BSDF answers as a complete
 one, to the last bit; that nothing else has been asked for is checked after every pass of the
 rendering. If something has, all is built in full, and the pass is rendered again: the image is the
 same in any case.
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from glintbsdf.footprint.domain import NOTHING, Gate, Reach, Recorder, waiting
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.footprint.domain import NOTHING, Domain, Gate, Recorder
+from glintbsdf.maps.normalmap import MapShape
 from glintbsdf.scene import passes, rendering
 
 #: Paths of a survey, about: a second's work of two CPU cores.
@@ -31,19 +31,19 @@ NOTABLE = 1e5
 
 @dataclass
 class Inspected:
-    """A scene and its glint BSDFs, in the order in which Mitsuba has made them."""
+    """A scene and its glint BSDFs, in the order in which ``mi.traverse`` finds them."""
 
     scene: mi.Scene
     bsdfs: list
 
 
 def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> Inspected:
-    """Load a scene from XML, its glint BSDFs not yet built as far as they can wait."""
-    with waiting() as bsdfs:
-        return Inspected(rendering.load_scene(filename, parameters), bsdfs)
+    """Load a scene from XML, its glint BSDFs not yet built."""
+    scene = rendering.load_scene(filename, parameters, deferred=True)
+    return Inspected(scene, rendering.glint_bsdfs(scene))
 
 
-def survey(inspected: Inspected, spp: int | None = None) -> list[Reach | None]:
+def survey(inspected: Inspected, spp: int | None = None) -> list[Domain | None]:
     """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel.
 
     None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect as
@@ -62,8 +62,8 @@ def survey(inspected: Inspected, spp: int | None = None) -> list[Reach | None]:
     film = passes.whole(sensor.film())
     wanted = min(spp, max(1, PATHS // film.pixels))
     few = max(count for count in range(1, wanted + 1) if spp % count == 0)
-    maps = [map_of(bsdf) for bsdf in inspected.bsdfs]
-    recorders = [normal_map and Recorder(normal_map) for normal_map in maps]
+    shapes = [bsdf.map_shape for bsdf in inspected.bsdfs]
+    recorders = [None if shape is None else Recorder(shape) for shape in shapes]
     for bsdf, recorder in zip(inspected.bsdfs, recorders, strict=True):
         bsdf.watch = recorder
     try:
@@ -75,43 +75,35 @@ def survey(inspected: Inspected, spp: int | None = None) -> list[Reach | None]:
             bsdf.watch = None
 
 
-def map_of(bsdf: object) -> NormalMap | None:
-    """The map of a BSDF, whether or not it can be built for a part of it."""
-    return bsdf.normal_map or getattr(getattr(bsdf, "pndf", None), "normal_map", None)
-
-
-def able_to_wait(inspected: Inspected) -> list:
-    """The BSDFs that can be built late."""
-    return [bsdf for bsdf in inspected.bsdfs if bsdf.normal_map is not None]
-
-
 def build(inspected: Inspected) -> None:
-    """Build all BSDFs in full that have waited."""
-    for bsdf in able_to_wait(inspected):
+    """Build all BSDFs in full."""
+    for bsdf in inspected.bsdfs:
         bsdf.build()
         bsdf.watch = None
 
 
-def build_trimmed(inspected: Inspected, reaches: list[Reach | None]) -> None:
-    """Build all BSDFs that have waited for their reaches and a margin; without a reach, not at all.
+def build_trimmed(inspected: Inspected, domains: list[Domain | None]) -> None:
+    """Build all BSDFs for their domains and a margin; without a domain, not at all. Those without a
+    map are built in full.
 
     Args:
         inspected: from :func:`load`, nothing built yet.
-        reaches: from :func:`survey`.
+        domains: from :func:`survey`.
     """
-    for bsdf, reach in zip(inspected.bsdfs, reaches, strict=True):
-        if bsdf.normal_map is None:
+    for bsdf, domain in zip(inspected.bsdfs, domains, strict=True):
+        if bsdf.map_shape is None:
+            bsdf.build()
             continue
-        bsdf.watch = Gate(bsdf.normal_map, NOTHING if reach is None else reach.widened())
-        if reach is not None:
-            bsdf.build(reach.widened())
+        bsdf.watch = Gate(bsdf.map_shape, NOTHING if domain is None else domain.widened())
+        if domain is not None:
+            bsdf.build(domain.widened())
 
 
 class Trimmed:
     """Glint BSDFs that hold no more than the scene asks for, and all as soon as that is too little.
 
     Its :meth:`missed` is for :class:`~glintbsdf.scene.rendering.Renderer`: what trimmed BSDFs have
-    answered within their reach stays, as it is the same to the last bit.
+    answered within their domain stays, as it is the same to the last bit.
 
     Args:
         inspected: from :func:`load`.
@@ -129,7 +121,7 @@ class Trimmed:
     def missed(self) -> bool:
         """Whether anything else has been asked for since the last call; then all is built now."""
         if not self.sufficed or not any(
-            bsdf.watch.missed() for bsdf in able_to_wait(self.inspected)
+            bsdf.watch is not None and bsdf.watch.missed() for bsdf in self.inspected.bsdfs
         ):
             return False
         self.sufficed = False
@@ -148,8 +140,8 @@ class Finding:
 
     Attributes:
         plugin, name (str): its type and its id.
-        normal_map (NormalMap): None for one without a map.
-        reach (Reach): what it is asked for, None for nothing, or where there is no map.
+        shape (MapShape): of its map, None for one without a map.
+        domain (Domain): what it is asked for, None for nothing, or where there is no map.
         complete, trimmed (dict[str, int]): memory of each part, bytes; the same where nothing can
             be trimmed.
         left_out (list[str]): what its parameters leave out of what is built and evaluated.
@@ -157,8 +149,8 @@ class Finding:
 
     plugin: str
     name: str
-    normal_map: NormalMap | None
-    reach: Reach | None
+    shape: MapShape | None
+    domain: Domain | None
     complete: dict[str, int]
     trimmed: dict[str, int]
     left_out: list[str]
@@ -170,7 +162,7 @@ class Finding:
         saved = sum(self.complete.values()) - sum(self.trimmed.values())
         if saved >= NOTABLE:
             lines += self.lines("--trim", [*amounts(self.trimmed), f"{saved / 1e6:8.1f} MB  saved"])
-        elif self.normal_map is not None:
+        elif self.shape is not None:
             lines += self.lines("--trim", ["saves nothing here"])
         lines += self.lines("left out", self.left_out)
         return "\n".join(lines)
@@ -183,27 +175,27 @@ class Finding:
 
     def asked(self) -> list[str]:
         """Lines about what of the map is asked for."""
-        if self.normal_map is None:
+        if self.shape is None:
             return ["none"]
-        width, height = self.normal_map.width, self.normal_map.height
-        lines = [f"{width} × {height} texels, {self.normal_map.wrap_mode}"]
-        if self.reach is None:
+        width, height = self.shape.width, self.shape.height
+        lines = [f"{width} × {height} texels, {self.shape.wrap_mode}"]
+        if self.domain is None:
             return [*lines, "no path meets it"]
         share = 1.0
-        for (first, last), texels in ((self.reach.columns, width), (self.reach.rows, height)):
+        for (first, last), texels in ((self.domain.columns, width), (self.domain.rows, height)):
             share *= min((last - first + 1) / texels, 1)
         ranges = [
             f"{axis} {(first + 0.5) / texels:.4g} to {(last + 0.5) / texels:.4g}"
             for axis, (first, last), texels in (
-                ("u", self.reach.columns, width),
-                ("v", self.reach.rows, height),
+                ("u", self.domain.columns, width),
+                ("v", self.domain.rows, height),
             )
         ]
         return [
             *lines,
             f"asked for: {', '.join(ranges)}, {100 * share:.3g} % of the map",
-            f"footprints: standard deviations of {self.reach.smallest:.3g} to "
-            f"{self.reach.largest:.3g} texels",
+            f"footprints: standard deviations of {self.domain.smallest:.3g} to "
+            f"{self.domain.largest:.3g} texels",
         ]
 
 
@@ -224,12 +216,12 @@ def inspect(inspected: Inspected, spp: int | None = None) -> list[Finding]:
         inspected: from :func:`load`.
         spp: samples per pixel of the rendering, None for the scene's: footprints depend on it.
     """
-    reaches = survey(inspected, spp)
-    build_trimmed(inspected, reaches)
+    domains = survey(inspected, spp)
+    build_trimmed(inspected, domains)
     trimmed = [bsdf.parts() for bsdf in inspected.bsdfs]
     build(inspected)
-    reaches = survey(inspected, spp)  # once more, by the glints themselves
+    domains = survey(inspected, spp)  # once more, by the glints themselves
     return [
-        Finding(bsdf.owner, bsdf.name, map_of(bsdf), reach, bsdf.parts(), parts, bsdf.left_out())
-        for bsdf, reach, parts in zip(inspected.bsdfs, reaches, trimmed, strict=True)
+        Finding(bsdf.owner, bsdf.name, bsdf.map_shape, domain, bsdf.parts(), parts, bsdf.left_out())
+        for bsdf, domain, parts in zip(inspected.bsdfs, domains, trimmed, strict=True)
     ]

@@ -30,15 +30,58 @@ FORMATS = (".exr", ".png")
 # ---------------------------------------------------------------------------------------------
 
 
-def load_scene(filename: str | Path, parameters: Mapping[str, str] | None = None) -> mi.Scene:
+def load_scene(
+    filename: str | Path,
+    parameters: Mapping[str, str] | None = None,
+    deferred: bool = False,
+) -> mi.Scene:
     """Load a scene from XML. ``parameters`` takes the place of its ``$key`` and ``<default>``.
+
+    With ``deferred``, its glint BSDFs build nothing yet: :func:`glint_bsdfs` finds them, and their
+    ``build`` is called for what the scene asks of them.
 
     Gives Dr.Jit a second thread where it has only one: Mitsuba would never return from reading an
     OpenEXR file.
     """
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
-    return mi.load_file(str(filename), **(parameters or {}))
+    parameters = dict(parameters or {})
+    if not deferred:
+        return mi.load_file(str(filename), **parameters)
+    config = mi.parser.ParserConfig(mi.variant())
+    with folder_of_files(Path(filename).resolve().parent):
+        state = mi.parser.parse_file(config, str(filename), **parameters)
+        mi.parser.transform_all(config, state)
+        for node in state.nodes:
+            if node.props.plugin_name() in DEFERRABLE:
+                node.props["deferred"] = True
+        scene = mi.parser.instantiate(config, state)
+    return scene if isinstance(scene, mi.Scene) else scene[0]
+
+
+#: Plugins that build their structures late where a scene is loaded for that.
+DEFERRABLE = ("glint_diffuse", "glint_elements", "glint_filtered", "glint_manifold", "glint_mip")
+
+
+@contextmanager
+def folder_of_files(folder: Path) -> Iterator[None]:
+    """Look for a scene's files in ``folder`` first, as ``mi.load_file`` does."""
+    resolver = mi.file_resolver()
+    before = [resolver[k] for k in range(len(resolver))]
+    resolver.prepend(str(folder))
+    try:
+        yield
+    finally:
+        resolver.clear()
+        for path in before:
+            resolver.append(path)
+
+
+def glint_bsdfs(scene: mi.Scene) -> list:
+    """All BSDFs of this package in a scene, wherever they are nested, each once."""
+    from glintbsdf.bridge.bsdf import FootprintBSDF
+
+    return [node for node in mi.traverse(scene).hierarchy if isinstance(node, FootprintBSDF)]
 
 
 def pixel_angle(sensor: mi.Sensor) -> float:

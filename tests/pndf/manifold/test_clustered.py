@@ -25,7 +25,7 @@ from glintbsdf.pndf.manifold.clustered import (
     element_count,
     on_cut,
 )
-from glintbsdf.pndf.manifold.exact import quad_density
+from glintbsdf.pndf.manifold.mesh import quad_density
 
 THRESHOLDS = (1e-4, 1e-3, 1e-2)
 

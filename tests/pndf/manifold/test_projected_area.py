@@ -14,7 +14,7 @@ from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check import suite
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.footprint.kernels import KERNELS
-from glintbsdf.pndf.manifold.exact import TexelMesh
+from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import (
     MANY_QUADS,
     ORDERS,

@@ -177,7 +177,7 @@ def test_normals_of_quads_over_bins(variant):
     normal_map = maps.leather(64, seed=1)
     mesh = Manifold(normal_map, epsilon=EPSILON)
     row, column = (v.ravel() for v in np.indices((64, 64)))
-    bins = Bins(mesh.bounds())
+    bins = Bins(mesh.normal_bounds())
     spread = bins.spread(mesh.effective_triangles, row, column)
     assert np.allclose(spread.sum(1), 1, atol=2e-6)
     centres = np.array(bins.normal(dr.arange(mi.UInt32, spread.shape[1]), mi.Vector2f(0.5))).T
@@ -378,7 +378,7 @@ def load(normal_map, **parameters):
 def test_shared_suite(variant, normal_map, max_error):
     bsdf = load(normal_map, max_error=max_error)
     assert bsdf.pndf.level(bsdf.footprint(VIEW.interaction())).numpy().item() >= 0
-    lower, upper = (tuple(map(float, v)) for v in bsdf.pndf.bounds())
+    lower, upper = (tuple(map(float, v)) for v in bsdf.pndf.normal_bounds())
     suite.check_chi2(bsdf, VIEW, (lower, upper), test_count=3)
     for view in (VIEW, suite.EXTREME_VIEWS["1000:1"]):
         suite.check_eval_pdf(bsdf, view, 500)

@@ -12,7 +12,7 @@ integrates to one; and the sampler draws from exactly this density.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from math import ceil, exp, inf, pi, sqrt
 
@@ -20,20 +20,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
+from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
-
-#: Of the lists; part of their name in the cache.
-VERSION = 6
+from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
 FEW_CELLS = 25
@@ -132,7 +131,7 @@ class SeedAxis:
         return mi.Int(texel) + (BLOCK if clamped else 0), position - texel
 
 
-class Mixture:
+class Mixture(PNDF):
     """A P-NDF of Gaussian elements on a lattice of cells; what all kinds of them share.
 
     A subclass sets
@@ -189,9 +188,13 @@ class Mixture:
         """Normal and Jacobian of the seed with these indices."""
         raise NotImplementedError
 
-    def weights(self, footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
+    def weights(self, query: Query) -> tuple[TexelKernel, mi.Bool, mi.Float]:
         """N(0, T), which weighs the elements, in cells; whether to sum all that it covers; and ρ²
         of its cut."""
+        return query.once((self, "weights"), lambda: self.weigh(query.footprint))
+
+    def weigh(self, footprint: Footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
+        """What :meth:`weights` returns."""
         columns, rows = self.map_cells
         added = (self.variance, self.variance)
         kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
@@ -208,14 +211,11 @@ class Mixture:
         """What the footprint sees of every element."""
         return Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=self.variance))
 
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it.
-
-        ``footprint``: a :class:`~.Footprint`, in the UV space of the map.
-        """
-        kernel, few, cut = self.weights(footprint)
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it."""
+        kernel, few, cut = self.weights(query)
         seen = self.seen(kernel)
-        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+        active = active & (dr.squared_norm(m) < 1)
 
         def share(area, near):
             return area * dr.clip((cut - near) * (1 / FADE), 0, 1)
@@ -243,8 +243,8 @@ class Mixture:
         mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
         return density / mass
 
-    def sample(
-        self, footprint, sample1: mi.Float, sample2: mi.Point2f, active: bool | mi.Bool = True
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D.
 
@@ -252,10 +252,8 @@ class Mixture:
         the footprint, then an element seen there, accepted such that the mass seen there, which
         differs from point to point, does not count. Then a normal of this element. The random
         numbers of all but the first point are a hash of the samples.
-
-        A normal outside the disk is an invalid sample, as D is 0 there.
         """
-        kernel, _, cut = self.weights(footprint)
+        kernel, _, cut = self.weights(query)
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
 
         def attempt(count, x, y, offset, active):
@@ -290,12 +288,13 @@ class Mixture:
         z = mi.warp.square_to_std_normal(mi.Point2f(uniform(random[0]), uniform(random[1])))
         return mean + distribution.sample(mi.Vector2f(z))
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of elements and lists, bytes."""
-        return sum(self.parts.values())
+    def smooth(self) -> SmoothBeckmann:
+        return SmoothBeckmann(
+            lambda: smooth_alpha(self.alpha_squared(), self.sigma_r),
+            self.roughness_keys,
+            self.owner,
+        )
 
-    @property
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
         lists = 0 if self.lists is None else self.lists.nbytes
@@ -322,6 +321,7 @@ def draw_neighbour(x, random):
 DENSEST = sum(exp(-0.5 * (k / SIGMA_H) ** 2) for k in range(-3, 4)) / (SIGMA_H * sqrt(2 * pi))
 
 
+@register("elements", title="elements", plugin="glint_elements")
 class Elements(Mixture):
     """Elements of a normal map, and their exact sampler.
 
@@ -336,8 +336,8 @@ class Elements(Mixture):
             steps makes the map.
         curved (bool): whether elements follow the map's Jacobian (Eq. 13) or are flat (Eq. 12).
         owner (str): whom errors name, usually the plugin.
-        reach (Reach): what will be asked; None for anything. Where all footprints are summed cell
-            by cell, no lists are made; within the reach D is the same to the last bit.
+        domain (Domain): what will be asked; None for anything. Where all footprints are summed cell
+            by cell, no lists are made; within the domain D is the same to the last bit.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it and through
@@ -347,9 +347,6 @@ class Elements(Mixture):
     Raises :class:`~.ParameterError`.
     """
 
-    # What others ask a P-NDF of a normal map for: roughness makes a clamp needless.
-    kernel, epsilon = "gaussian", 0.0
-
     def __init__(
         self,
         normal_map: NormalMap,
@@ -357,19 +354,19 @@ class Elements(Mixture):
         step: float = 0.5,
         curved: bool = True,
         owner: str = "Elements",
-        reach: Reach | None = None,
+        domain: Domain | None = None,
     ) -> None:
         check_sigma_r(owner, sigma_r)
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
-        self.wrap_mode, self.reach = normal_map.wrap_mode, reach
+        self.wrap_mode = normal_map.wrap_mode
         self.data = mi.TensorXf(normal_map.normals)
         self.sigma_r = mi.Float(sigma_r)
-        key = f"elements {VERSION} {normal_map.content_hash} {sigma_r!r} {step!r} {curved}"
-        self.build(lambda build: load_or_build(key, build))
+        self.build(domain)
 
-    def build(self, cached=lambda build: build()) -> None:
+    def build(self, domain: Domain | None = None) -> None:
         """Make everything that depends on ``data`` and ``sigma_r``."""
+        self.domain = domain
         height, width, _ = self.data.shape
         self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
         self.map_cells, self.seeds = (x.cells, y.cells), x.seeds
@@ -398,8 +395,9 @@ class Elements(Mixture):
         if self.aligned and self.curved:
             self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
         self.lists = None
-        if self.reach is None or not self.all_small(self.reach.largest):
-            self.lists = QuadLists(self.lattice, cached(self.build_lists))
+        if domain is None or not self.all_small(domain.largest):
+            arrays = self.cached(self.build_lists, self.sigma_r[0], self.step, self.curved)
+            self.lists = QuadLists(self.lattice, arrays)
 
     def all_small(self, sigma: float) -> bool:
         """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
@@ -408,7 +406,7 @@ class Elements(Mixture):
         largest = Footprint(
             mi.Point2f(0), mi.Vector2f(sigma / width, 0), mi.Vector2f(0, sigma / height)
         )
-        return bool(dr.all(self.weights(largest)[1]))
+        return bool(dr.all(self.weigh(largest)[1]))
 
     # --------------------------------------------------------------------------------------------
     #  The elements
@@ -544,10 +542,10 @@ class Elements(Mixture):
         blocks = BlocksOfEllipses(self.lattice, self.ellipses, len(self.places))
         normals = self.data.numpy().reshape(-1, 2)
         return Builder(
-            blocks, normals, self.extent(), BYTES_PER_CELL[len(self.places) > 1]
+            blocks, normals, self.normal_bounds(), BYTES_PER_CELL[len(self.places) > 1]
         ).arrays()
 
-    def extent(self) -> tuple[np.ndarray, np.ndarray]:
+    def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The rectangle (lower, upper) that holds the ellipses of all cells, and a margin.
 
         In the margin the cells at its border are found: of a flat map, all that is beyond reach.
@@ -571,13 +569,17 @@ class Elements(Mixture):
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check new values, and rebuild. Derivatives keep flowing to them."""
         if keys and not {"data", "sigma_r"} & set(keys):
             return
         check_sigma_r(self.owner, self.sigma_r[0])
         self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner)
-        self.build()
+        self.changed = True
+        self.build(self.domain)
+
+    def parts(self) -> dict[str, int]:
+        return {"map": self.normal_map.nbytes + 4 * dr.width(self.data), **super().parts()}
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, inf, pi, sqrt
 
@@ -10,17 +11,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import ParameterError, check, check_whole
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice
 from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
+from glintbsdf.pndf.base import register
 from glintbsdf.pndf.elements.elements import NORMAL_REACH, Mixture, check_sigma_r
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import SHIFT, Builder, QuadLists
-
-#: Of what is built; part of its name in the cache.
-VERSION = 2
 
 #: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
 #: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
@@ -56,6 +55,14 @@ class Surroundings:
         return -self.reach_v, self.reach_v
 
 
+@register(
+    "flakes",
+    title="flakes",
+    plugin="glint_elements",
+    takes_map=False,
+    options={"density": 4000.0},
+    settings={"flake_density": 4000.0},
+)
 class Flakes(Mixture):
     """Flat elements scattered over the unit UV square, which repeats, and their exact sampler.
 
@@ -94,8 +101,7 @@ class Flakes(Mixture):
         check_memory(owner, self.count)
         self.sigma_r = mi.Float(sigma_r)
 
-        key = f"flakes {VERSION} {self.count} {self.alpha!r} {self.seed}"
-        flakes = load_or_build(key, self.scatter)
+        flakes = self.cached(self.scatter, self.count, self.alpha, self.seed)
         n = cells_for(self.count)
         self.map_cells = n, n
         self.variance = (SIGMA_H * n / sqrt(self.count)) ** 2
@@ -105,7 +111,7 @@ class Flakes(Mixture):
         self.densest = float(flakes["densest"])
         self.element_bytes = 4 * (dr.width(self.flakes) + dr.width(self.areas))
         self.flake_normals = flakes["flakes"].reshape(-1, 4)[flakes["areas"].ravel() > 0, 2:]
-        self.build(lambda build: load_or_build(f"{key} {sigma_r!r}", build))
+        self.build()
 
     def scatter(self) -> dict[str, np.ndarray]:
         """Places, areas and normals of the flakes, n×n, by cells; and the largest mass seen."""
@@ -117,8 +123,16 @@ class Flakes(Mixture):
         flakes = np.concatenate([np.nan_to_num(places), normals], axis=-1).astype(np.float32)
         return {"flakes": flakes, "areas": areas, "densest": np.array(densest(places, areas))}
 
-    def build(self, cached=lambda build: build()) -> None:
-        """Make everything that depends on ``sigma_r``."""
+    def alpha_squared(self) -> mi.Vector2f:
+        return mi.Vector2f(self.alpha**2)
+
+    def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        # In the margin the cells at its border are found.
+        outer = (NORMAL_REACH + 1.5) * self.sigma_r[0]
+        return self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
+
+    def build(self, domain: Domain | None = None) -> None:
+        """Make everything that depends on ``sigma_r``, for any query."""
         reach = NORMAL_REACH * self.sigma_r[0]
 
         def ellipses(row, column, active):
@@ -129,15 +143,14 @@ class Flakes(Mixture):
             return dr.gather(mi.Float, self.areas, self.index(row, column), active) > 0
 
         blocks = BlocksOfFlakes(self.lattice, ellipses, occupied, self.count)
-        outer = reach + 1.5 * self.sigma_r[0]  # in the margin, the cells at its border are found
-        bounds = self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
 
-        def lists(allowed):
-            return Builder(blocks, self.flake_normals, bounds, allowed).arrays()
+        def build_lists(allowed: float = BYTES_OF_LISTS) -> dict[str, np.ndarray]:
+            return Builder(blocks, self.flake_normals, self.normal_bounds(), allowed).arrays()
 
-        self.lists = QuadLists(self.lattice, cached(lambda: lists(BYTES_OF_LISTS)))
+        key = self.count, self.alpha, self.seed, self.sigma_r[0]
+        self.lists = QuadLists(self.lattice, self.cached(build_lists, *key))
         # With a single cell of normals: all flakes, block by block.
-        self.all = QuadLists(self.lattice, lists(0))
+        self.all = QuadLists(self.lattice, build_lists(0))
 
     def index(self, row, column):
         return mi.UInt32(row * self.map_cells[0] + column)
@@ -200,16 +213,15 @@ class Flakes(Mixture):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check a new roughness, and rebuild."""
         if not keys or "sigma_r" in keys:
             check_sigma_r(self.owner, self.sigma_r[0])
+            self.changed = True
             self.build()
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of flakes and lists, bytes."""
-        return super().nbytes + self.all.nbytes
+    def parts(self) -> dict[str, int]:
+        return {**super().parts(), "lists of flakes by place": self.all.nbytes}
 
     def __repr__(self) -> str:
         return (

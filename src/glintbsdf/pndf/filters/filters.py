@@ -9,7 +9,7 @@ turns their averages, with the roughness α of the material between the texels' 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
 
@@ -18,11 +18,13 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check, check_choice
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels
-from glintbsdf.microfacet.frame import SmithMasking
+from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
+from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
 
 # ------------------------------------------------------------------------------------------------
@@ -161,15 +163,8 @@ METHODS = {
 }
 
 
-class LobeFootprint(Footprint):
-    """A footprint with the lobe of the normals in it, for those who ask for the lobe repeatedly."""
-
-    def __init__(self, footprint: Footprint, lobe: SlopeLobe) -> None:
-        super().__init__(footprint.uv, footprint.du, footprint.dv)
-        self.lobe = lobe
-
-
-class Filtered:
+@register("filters", title="filters", plugin="glint_filtered")
+class Filtered(PNDF):
     """A P-NDF that is one lobe, by one of the filters of RTR 9.13.1.
 
     Belongs to the variant of Mitsuba that is active when it is made.
@@ -181,8 +176,8 @@ class Filtered:
         distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
         max_anisotropy (float): ≥ 1, see :class:`~.MomentPyramid`.
         owner (str): whom errors name, usually the plugin.
-        reach (Reach): what will be asked; None for anything. MIP levels that no such footprint
-            needs are then left out. Lobes within the reach are the same to the last bit.
+        domain (Domain): what will be asked; None for anything. MIP levels that no such footprint
+            needs are then left out. Lobes within the domain are the same to the last bit.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
@@ -192,8 +187,7 @@ class Filtered:
     Raises :class:`~.ParameterError`.
     """
 
-    # What the reference is to do alike: a Gaussian footprint, no clamped triangles.
-    kernel, epsilon = "gaussian", 0.0
+    maskings = ("smith", "none")
 
     def __init__(
         self,
@@ -203,7 +197,7 @@ class Filtered:
         distribution: str = "beckmann",
         max_anisotropy: float = 16.0,
         owner: str = "Filtered",
-        reach: Reach | None = None,
+        domain: Domain | None = None,
     ) -> None:
         check_choice(owner, "method", method, tuple(METHODS))
         check_choice(owner, "distribution", distribution, DISTRIBUTIONS)
@@ -218,16 +212,16 @@ class Filtered:
         check(max_anisotropy >= 1, owner, "max_anisotropy", "a number ≥ 1", max_anisotropy)
         self.name, self.distribution, self.owner = method, distribution, owner
         self.max_anisotropy, self.wrap_mode = float(max_anisotropy), normal_map.wrap_mode
-        self.reach = reach
         self.alpha = mi.Float(alpha)
         self.check_alpha()
         self.data = mi.TensorXf(normal_map.normals)
-        self.build(normal_map)
-
-    def build(self, normal_map: NormalMap) -> None:
-        """Check the slopes, and make the MIP chain of ``self.data``."""
         self.normal_map = normal_map
-        z_squared = 1 - (normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
+        self.build(domain)
+
+    def build(self, domain: Domain | None = None) -> None:
+        """Check the slopes, and make the MIP chain of ``self.data``."""
+        self.domain = domain
+        z_squared = 1 - (self.normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
         check_texels(
             self.owner,
             "data",
@@ -239,7 +233,7 @@ class Filtered:
             self.wrap_mode,
             self.method.moments,
             max_anisotropy=self.max_anisotropy,
-            reach=self.reach,
+            domain=self.domain,
             spread=self.method.spread,
             between=self.method.between,
         )
@@ -255,50 +249,59 @@ class Filtered:
             self.alpha[0],
         )
 
-    def lobe(self, footprint: Footprint) -> SlopeLobe:
-        """The lobe of a footprint, given in the UV space of the map."""
-        if isinstance(footprint, LobeFootprint):
-            return footprint.lobe
-        averages = self.pyramid.average(footprint)
-        return self.method.lobe(averages, dr.square(self.alpha), self.distribution)
+    def lobe(self, query: Query | Footprint) -> SlopeLobe:
+        """The lobe of a query, or of a footprint in the UV space of the map."""
+        query = Query.of(query)
+        return query.once((self, "lobe"), lambda: self.make_lobe(query))
 
-    def with_lobe(self, footprint: Footprint) -> LobeFootprint:
-        """The footprint, with its lobe."""
-        return LobeFootprint(footprint, self.lobe(footprint))
+    def make_lobe(self, query: Query) -> SlopeLobe:
+        """What :meth:`lobe` returns."""
+        averages = self.pyramid.average(query)
+        alpha = query.parameter("alpha", self.alpha)
+        return self.method.lobe(averages, dr.square(alpha), self.distribution)
 
-    def eval(self, m: mi.Vector2f, footprint: Footprint, active: bool | mi.Bool = True) -> mi.Float:
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk; 0 outside of it."""
-        return dr.select(active, self.lobe(footprint).eval(m), 0)
+        return dr.select(active, self.lobe(query).eval(m), 0)
 
-    def sample(
-        self,
-        footprint: Footprint,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: bool | mi.Bool = True,
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D: the normals visible from straight above."""
-        return self.lobe(footprint).sample_visible(mi.Vector3f(0, 0, 1), sample1, sample2).xy
+        return self.lobe(query).sample_visible(mi.Vector3f(0, 0, 1), sample1, sample2).xy
+
+    def sample_visible(self, wi, query, sample1, sample2, active):
+        """One of the normals of the lobe that the view sees."""
+        return self.lobe(query).sample_visible(wi, sample1, sample2)
+
+    def visible_pdf(self, wi, m, density, query, active):
+        return self.lobe(query).visible_pdf(wi, m, density)
+
+    def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
+        """``smith``: that of the lobe's facets about its mean facet; LEADR's projects as well."""
+        if name != "smith":
+            return super().masking(name, height_correlated)
+        return LobeMasking(self, height_correlated, projection=self.name == "leadr")
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
         callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check what has changed, and rebuild. Derivatives keep flowing."""
         self.check_alpha()
         if not keys or "data" in keys:
-            self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
+            self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+            self.changed = True
+            self.build(self.domain)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the MIP chain, bytes."""
-        return self.pyramid.nbytes
-
-    @property
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
-        return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.nbytes}
+        levels = f"MIP levels {self.pyramid.first} to {self.pyramid.top}"
+        return {
+            "map": self.normal_map.nbytes + 4 * dr.width(self.data),
+            levels: self.pyramid.nbytes,
+        }
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape
@@ -311,39 +314,6 @@ class Filtered:
 # ------------------------------------------------------------------------------------------------
 #  In the microfacet frame
 # ------------------------------------------------------------------------------------------------
-
-
-class VisibleNormals:
-    """Draws from a lobe's normals those that the viewer sees; see ``microfacet.PndfNormals``.
-
-    Args:
-        pndf (Filtered): whose lobe.
-    """
-
-    def __init__(self, pndf: Filtered) -> None:
-        self.pndf = pndf
-
-    def sample(
-        self,
-        wi: mi.Vector3f,
-        footprint: Footprint,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool,
-    ) -> mi.Vector3f:
-        """A unit normal for the view from ``wi``."""
-        return self.pndf.lobe(footprint).sample_visible(wi, sample1, sample2)
-
-    def pdf(
-        self,
-        wi: mi.Vector3f,
-        m: mi.Vector3f,
-        density: mi.Float,
-        footprint: Footprint,
-        active: mi.Bool,
-    ) -> mi.Float:
-        """Density of ``m`` per solid angle, given ``density``, which is D(m)."""
-        return self.pndf.lobe(footprint).visible_pdf(wi, m, density)
 
 
 class LobeMasking(SmithMasking):
@@ -367,20 +337,25 @@ class LobeMasking(SmithMasking):
         super().__init__(height_correlated)
         self.pndf, self.projection = pndf, projection
 
-    def smith_lambda(self, w: mi.Vector3f, footprint: Footprint, active: mi.Bool) -> mi.Float:
-        lobe = self.pndf.lobe(footprint)
+    def smith_lambda(self, w: mi.Vector3f, query: Query, active: mi.Bool) -> mi.Float:
+        lobe = self.pndf.lobe(query)
         mean = lobe.mean_cosine(w)
         facing = mean > 0
         ratio = lobe.visible_area(w) / dr.select(facing, mean, 1)
         return dr.select(facing, dr.maximum(ratio - 1, 0), 0)
 
     def eval(
-        self, wi: mi.Vector3f, wo: mi.Vector3f, footprint: Footprint, active: mi.Bool
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        query: Query,
+        mode: mi.TransportMode,
+        active: mi.Bool,
     ) -> mi.Float:
-        lobe = self.pndf.lobe(footprint)
+        lobe = self.pndf.lobe(query)
         mean_i, mean_o = lobe.mean_cosine(wi), lobe.mean_cosine(wo)
         facing = (mean_i > 0) & (mean_o > 0)
-        value = super().eval(wi, wo, footprint, active)
+        value = super().eval(wi, wo, query, mode, active)
         if self.projection:
             value = value * wi.z / dr.select(facing, mean_i, 1)
         return dr.select(facing, value, 0)

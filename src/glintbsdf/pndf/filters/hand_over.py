@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.errors import check
-from glintbsdf.footprint.domain import Reach
-from glintbsdf.footprint.kernels import TexelKernel
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.query import Query
+from glintbsdf.pndf.base import PNDF
 from glintbsdf.pndf.filters.filters import Filtered
 
 #: Roughness of the lobe besides that of the map: almost none, as a P-NDF has none of its own.
 ALPHA = 1e-3
 
 
-class HandOver:
+class HandOver(PNDF):
     """A mixture of a P-NDF and LEAN's lobe of the same map, by the size of the footprint.
 
     The size is the geometric mean of the footprint's standard deviations along its axes, in texels.
@@ -26,42 +30,49 @@ class HandOver:
         near: the P-NDF of a normal map.
         sigma (float): texels, > 0.
         owner (str): whom errors name, usually the plugin.
-        reach (Reach): what will be asked, see :class:`Filtered`.
+        domain (Domain): what will be asked, see :class:`Filtered`.
     """
 
     def __init__(
-        self, near: object, sigma: float, owner: str = "HandOver", reach: Reach | None = None
+        self, near: PNDF, sigma: float, owner: str = "HandOver", domain: Domain | None = None
     ) -> None:
         check(sigma > 0, owner, "hand_over", "a number > 0", sigma)
-        self.near, self.sigma = near, float(sigma)
-        self.far = Filtered(near.normal_map, "lean", alpha=ALPHA, owner=owner, reach=reach)
+        self.near, self.sigma, self.owner, self.domain = near, float(sigma), owner, domain
+        self.far = Filtered(near.normal_map, "lean", alpha=ALPHA, owner=owner, domain=domain)
 
-    # What others ask a P-NDF of a normal map for.
+    # What is asked of a P-NDF of a normal map.
     data = property(lambda self: self.near.data)
     normal_map = property(lambda self: self.near.normal_map)
     kernel = property(lambda self: self.near.kernel)
     epsilon = property(lambda self: self.near.epsilon)
+    roughness_keys = property(lambda self: self.near.roughness_keys)
 
-    def weight(self, footprint) -> mi.Float:
+    def build(self, domain: Domain | None = None) -> None:
+        self.domain = domain
+        for part in (self.near, self.far):
+            part.build(domain)
+
+    def weight(self, query: Query | Footprint) -> mi.Float:
         """The lobe's share of the mixture, from 0 to 1."""
         height, width, _ = self.data.shape
-        kernel = TexelKernel("gaussian", footprint, height, width, self.normal_map.wrap_mode)
+        wrap_mode = self.normal_map.wrap_mode
+        kernel = Query.of(query).texel_kernel("gaussian", height, width, wrap_mode)
         area = kernel.sigma_u_given_v * kernel.sigma_v
         t = dr.clip(0.5 * dr.log2(area * (1 / self.sigma**2)), 0, 1)
         return t * t * (3 - 2 * t)
 
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk; 0 outside of it."""
-        weight = self.weight(footprint)
-        near = self.near.eval(m, footprint, mi.Bool(active) & (weight < 1))
-        far = self.far.eval(m, footprint, mi.Bool(active) & (weight > 0))
+        weight = self.weight(query)
+        near = self.near.eval(m, query, active & (weight < 1))
+        far = self.far.eval(m, query, active & (weight > 0))
         return dr.fma(1 - weight, near, weight * far)
 
-    def sample(
-        self, footprint, sample1: mi.Float, sample2: mi.Point2f, active: bool | mi.Bool = True
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D."""
-        weight = self.weight(footprint)
+        weight = self.weight(query)
         is_far = sample1 < weight
         sample1 = dr.select(
             is_far,
@@ -69,28 +80,28 @@ class HandOver:
             (sample1 - weight) / dr.select(weight < 1, 1 - weight, 1),
         )
         sample1 = dr.minimum(sample1, 1 - 2**-24)
-        near = self.near.sample(footprint, sample1, sample2, mi.Bool(active) & ~is_far)
-        return dr.select(is_far, self.far.sample(footprint, sample1, sample2), near)
+        near = self.near.sample(query, sample1, sample2, active & ~is_far)
+        return dr.select(is_far, self.far.sample(query, sample1, sample2), near)
+
+    def smooth(self) -> PNDF | None:
+        return self.near.smooth()
+
+    def masking(self, name: str, height_correlated: bool = True):
+        return self.near.masking(name, height_correlated)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.near.traverse(callback)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check new data, and rebuild."""
         self.near.parameters_changed(keys)
         if not keys or "data" in keys:
-            self.far.data = self.near.data
-            self.far.build(self.near.normal_map)
+            self.far.data, self.far.normal_map = self.near.data, self.near.normal_map
+            self.far.build(self.domain)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of both, bytes."""
-        return self.near.nbytes + self.far.nbytes
-
-    @property
     def parts(self) -> dict[str, int]:
-        """Memory of each part of both, bytes."""
-        return {**self.near.parts, **self.far.parts}
+        """Memory of each part of both, bytes; the map is the same."""
+        return {**self.far.parts(), **self.near.parts()}
 
     def __repr__(self) -> str:
         near, far = (str(x).replace("\n", "\n  ") for x in (self.near, self.far))

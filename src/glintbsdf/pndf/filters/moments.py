@@ -34,9 +34,11 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import floor_int
+from glintbsdf.footprint.query import Query
 
 #: Standard deviation of a level over that of the one before.
 RATIO = 2 ** (1 / 3)
@@ -366,8 +368,8 @@ class MomentPyramid:
         max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
         over_quad: function of the normals at the corners of a quad that returns the averages over
             it; by default that of ``moments`` by :func:`midpoint_rule`.
-        reach (Reach): what will be asked for; levels and parts of levels that no such footprint
-            needs are left out. What lies within the reach has the same averages to the last bit.
+        domain (Domain): what will be asked for; levels and parts of levels that no such footprint
+            needs are left out. What lies within the domain has the same averages to the last bit.
 
     Attributes:
         first, top (int): finest and coarsest level.
@@ -382,7 +384,7 @@ class MomentPyramid:
         finish: Callable = lambda averages: averages,
         max_anisotropy: float = 16.0,
         over_quad: Callable | None = None,
-        reach: Reach | None = None,
+        domain: Domain | None = None,
         spread: Spread = (),
         between: bool = True,
     ) -> None:
@@ -396,10 +398,10 @@ class MomentPyramid:
         self.top = self.first + 1
         while max(rows, columns) > level_sigma(self.top):
             self.top += 1
-        if reach is not None:  # with a margin for rounding
+        if domain is not None:  # with a margin for rounding
             last = self.top - 1
-            self.first = int(dr.clip(level_below(0.998 * reach.smallest**2), self.first, last))
-            last = int(dr.clip(level_below(1.002 * reach.largest**2), self.first, last))
+            self.first = int(dr.clip(level_below(0.998 * domain.smallest**2), self.first, last))
+            last = int(dr.clip(level_below(1.002 * domain.largest**2), self.first, last))
             self.top = last + 1
 
         def axes_of(number: int) -> tuple[Axis, Axis]:
@@ -407,7 +409,7 @@ class MomentPyramid:
             return tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
 
         shapes = [axes_of(number) for number in range(self.first, self.top + 1)]
-        windows = self.choose_windows(shapes, reach)
+        windows = self.choose_windows(shapes, domain)
         stored = []
 
         def keep(level: list) -> None:
@@ -430,17 +432,17 @@ class MomentPyramid:
                 keep(level)
         self.store(stored, shapes, windows)
 
-    def choose_windows(self, shapes: list[tuple[Axis, Axis]], reach: Reach | None) -> list:
+    def choose_windows(self, shapes: list[tuple[Axis, Axis]], domain: Domain | None) -> list:
         """What to store of each level: ``(first, number)`` of the rows, and of the columns.
 
-        All of all levels, or what lies within the reach, if that is less. It may lie across the
+        All of all levels, or what lies within the domain, if that is less. It may lie across the
         border of a periodic level, and is stored as it lies: lookups need not wrap then.
         """
         whole = [tuple((0, axis.count) for axis in axes) for axes in shapes]
         self.wraps = self.periodic
-        if reach is None:
+        if domain is None:
             return whole
-        ends = reach.rows, reach.columns
+        ends = domain.rows, domain.columns
         parts = [
             tuple(samples_within(axis, *end) for axis, end in zip(axes, ends, strict=True))
             for axes in shapes
@@ -502,12 +504,13 @@ class MomentPyramid:
     #  Lookup
     # --------------------------------------------------------------------------------------------
 
-    def average(self, footprint, active: bool | mi.Bool = True) -> list:
+    def average(self, query: Query | Footprint, active: bool | mi.Bool = True) -> list:
         """What is stored, averaged over a footprint: one ``mi.Float`` per channel.
 
-        ``footprint``: a :class:`~.Footprint`, in the UV space of the map.
+        ``query``: a query, or just a footprint in the UV space of the map.
         """
-        kernel = TexelKernel("gaussian", footprint, self.height, self.width, self.wrap_mode)
+        query = Query.of(query)
+        kernel = query.texel_kernel("gaussian", self.height, self.width, self.wrap_mode)
         major, variance_major, variance_minor = principal_axes(kernel)
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
         variance, step, steps, sharpness = taps(variance_major, variance)

@@ -12,6 +12,7 @@ the whole surface (global), l one microdetail (local), m the microdetails' centr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite, log, pi, sqrt
 
 import drjit as dr
@@ -21,6 +22,9 @@ from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import coherent_vertex, gaussian, pcg3d, uniform
 from glintbsdf.footprint.gaussian import is_literal_zero
 from glintbsdf.footprint.lattice import floor_int
+from glintbsdf.footprint.query import Query
+from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.smooth import SmoothBeckmann
 
 #: Cells of the coarsest grid are 2⁴⁰ times as wide as those of the finest. They hold 2⁸⁰
 #: microdetails, whose noise is below the last bit of a float: larger footprints need none larger.
@@ -366,12 +370,13 @@ def check_ranges(values: dict[str, float], owner: str) -> None:
     require("max_anisotropy", "a finite number ≥ 1", values["max_anisotropy"] >= 1)
 
 
-class Grid:
+@register("grid", title="grids", plugin="glint_grid", takes_map=False)
+class Grid(PNDF):
     """P-NDF of procedural microdetails (Listing 1).
 
     Its mean over places is exactly the Beckmann distribution of the roughness α_g. A single place
     is not normalised: more microdetails than their share reflecting in one direction are not made
-    up for by fewer in others. It cannot be sampled; draw from the mean instead.
+    up for by fewer in others. Samples are drawn from the mean.
 
     D(m) is the product of the Beckmann density and of a random factor of mean one, the number of
     reflecting microdetails over its expectation. Derivatives flow through the first: glints stay
@@ -397,8 +402,8 @@ class Grid:
     Raises :class:`~.ParameterError`.
     """
 
-    #: Nothing is stored.
-    nbytes = 0
+    maskings = ("beckmann",)
+    roughness_keys = ("alpha_u", "alpha_v")
 
     #: How the cells of a footprint are chosen; benchmarks put other ways in its place.
     covered_cells = CoveredCells
@@ -451,12 +456,34 @@ class Grid:
         self.colors, self.owner = colors, owner
         self.seed = pcg3d(mi.UInt32(seed), 0, 0)[0]
         self.derive()
+        self.mean = SmoothBeckmann(lambda: self.alpha, self.roughness_keys, owner)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check parameters that have changed, and derive what depends on them."""
         if not keys or set(keys) & set(self.NAMES):
             check_ranges({name: getattr(self, name)[0] for name in self.NAMES}, self.owner)
             self.derive()
+            self.mean.parameters_changed(keys)
+
+    def alpha_squared(self) -> mi.Vector2f:
+        return dr.square(self.alpha)
+
+    def smooth(self) -> SmoothBeckmann:
+        return self.mean
+
+    def masking(self, name: str = "beckmann", height_correlated: bool = False):
+        """That of the mean, as ``roughconductor`` has it."""
+        return super().masking(name, height_correlated)
+
+    # Samples come from the mean over all places.
+    def _sample(self, query, sample1, sample2, active):
+        return self.mean.sample(query, sample1, sample2, active)
+
+    def sample_visible(self, wi, query, sample1, sample2, active):
+        return self.mean.sample_visible(wi, query, sample1, sample2, active)
+
+    def visible_pdf(self, wi, m, density, query, active):
+        return self.mean.visible_pdf(wi, m, density, query, active)
 
     def derive(self) -> None:
         """Everything that depends on the parameters alone."""
@@ -478,15 +505,10 @@ class Grid:
             # The finest grid has one microdetail per cell
             self.scale = dr.exp(self.density * (0.5 * log(10)))
 
-    def eval(
-        self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True
-    ) -> mi.Float | mi.Color3f:
-        """D(m) over the disk of projected normals, in colour where there are ``colors``.
-
-        ``footprint``: a :class:`~.Footprint`.
-        """
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float | mi.Color3f:
+        """D(m) over the disk of projected normals, in colour where there are ``colors``."""
         squared_z = 1 - dr.squared_norm(m)
-        active = mi.Bool(active) & (squared_z > 1e-8)
+        active = active & (squared_z > 1e-8)
         cos_theta = dr.sqrt(dr.select(active, squared_z, 1))
         x = dr.select(active, m, 0) / cos_theta
         density = self.intensity * beckmann(x, self.alpha) * slope_jacobian(cos_theta)
@@ -495,7 +517,7 @@ class Grid:
             p = self.largest_p * dr.exp(-dr.squared_norm(x / self.alpha))
             active &= p > dr.smallest(mi.Float)
             hp = paraboloid_map(x, cos_theta) * self.cells_per_unit
-            noise = self.reflecting(hp, p, footprint, active) / dr.select(active, p, 1)
+            noise = self.reflecting(hp, p, query.footprint, active) / dr.select(active, p, 1)
         return dr.select(active, density * noise, 0)
 
     def reflecting(

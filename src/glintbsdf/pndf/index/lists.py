@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.progress import progress
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
 
 SHIFT = BLOCK.bit_length() - 1  # quad to block
@@ -271,9 +271,9 @@ class Window(NamedTuple):
         return Window(*(Span(0, axis.blocks, axis.blocks) for axis in (lattice.y, lattice.x)))
 
     @staticmethod
-    def touched(lattice: Lattice, reach: Reach) -> Window:
-        """The blocks that footprints within the reach touch."""
-        touched = lattice.y.touched_blocks(*reach.rows), lattice.x.touched_blocks(*reach.columns)
+    def touched(lattice: Lattice, domain: Domain) -> Window:
+        """The blocks that footprints within the domain touch."""
+        touched = lattice.y.touched_blocks(*domain.rows), lattice.x.touched_blocks(*domain.columns)
         axes = lattice.y, lattice.x
         return Window(*(Span(*t, a.blocks) for t, a in zip(touched, axes, strict=True)))
 
@@ -288,8 +288,6 @@ class QuadLists:
         ``entries``: quads as ``column << SHIFT | row in block``;
         ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
     """
-
-    VERSION = 3
 
     def __init__(
         self, lattice: Lattice, arrays: dict[str, np.ndarray], window: Window | None = None

@@ -25,13 +25,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check
 from glintbsdf.core.progress import progress
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.kernels import REACH, SIGMA_MAX
 from glintbsdf.footprint.lattice import BLOCK, Axis, floor_int
+from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.pndf.base import register
 from glintbsdf.pndf.index.lists import (
     RESOLUTION,
     SHIFT,
@@ -39,13 +40,11 @@ from glintbsdf.pndf.index.lists import (
     Builder,
     NormalCells,
     Packed,
-    QuadLists,
     walk,
 )
-from glintbsdf.pndf.manifold import exact as manifold
 from glintbsdf.pndf.manifold.cluster_fit import fit_clusters
-from glintbsdf.pndf.manifold.exact import (
-    Manifold,
+from glintbsdf.pndf.manifold.exact import FEW_QUADS, Manifold
+from glintbsdf.pndf.manifold.mesh import (
     equilateral,
     normal_in_quad,
     quad_density,
@@ -239,7 +238,6 @@ class Ladder:
         other; ``begin`` (K, …): where each begins.
     """
 
-    VERSION = 1
     JOINED = ("start", "offset", "entries", "elements", "first_of_row", "slab_of_x", "cell_of_y")
 
     def __init__(self, lattice: ClusterLattice, arrays: dict[str, np.ndarray]) -> None:
@@ -453,6 +451,13 @@ class Scaled:
         return self.kernel.value(offset * self.side)
 
 
+@register(
+    "clusters",
+    title="manifold, clusters",
+    plugin="glint_manifold",
+    options={"threshold": 0.004},
+    settings={"threshold": 0.004},
+)
 class ClusteredManifold(Manifold):
     """P-NDF of a normal map by clusters of quads (section 4.2), and its exact sampler.
 
@@ -471,7 +476,7 @@ class ClusteredManifold(Manifold):
         normal_map (NormalMap): the map.
         threshold (float): τ > 0.
         kernel, epsilon, owner: as for :class:`~.TexelMesh`.
-        reach: as for :class:`~.Manifold`; clusters are made of the whole map
+        domain: as for :class:`~.Manifold`; clusters are made of the whole map
             all the same.
 
     Attributes:
@@ -488,22 +493,17 @@ class ClusteredManifold(Manifold):
         kernel: str = "gaussian",
         epsilon: float = 1e-6,
         owner: str = "ClusteredManifold",
-        reach: Reach | None = None,
+        domain: Domain | None = None,
     ) -> None:
         check(0 < threshold and isfinite(threshold), owner, "threshold", "a finite number > 0",
               threshold)  # fmt: skip
         self.threshold = float(threshold)
-        key = (
-            f"clusters {Ladder.VERSION} {QuadLists.VERSION} {normal_map.content_hash} "
-            f"{epsilon!r} {self.threshold!r}"
-        )
-        self.cached_clusters = lambda build: load_or_build(key, build)
-        super().__init__(normal_map, kernel, epsilon, owner, reach)
-        self.cached_clusters = lambda build: build()  # of data that change, nothing is kept
+        super().__init__(normal_map, kernel, epsilon, owner, domain)
 
-    def build(self) -> None:
-        """Make everything that depends on ``self.data``; the cache may know most of it."""
-        super().build()
+    def build(self, domain: Domain | None = None) -> None:
+        """Make lists and clusters; the cache may know most of it. Clusters are always complete."""
+        super().build(domain)
+        self.make_vertices()
         height, width, _ = self.data.shape
         self.clusters = ClusterLattice(height, width, self.normal_map.wrap_mode)
         self.quad_vertices = dr.width(self.vertices) // 2
@@ -515,11 +515,11 @@ class ClusteredManifold(Manifold):
 
         # The largest footprint of the widest kernel.
         limit = self.threshold * (max(REACH.values()) * SIGMA_MAX) ** 2 * height * width
-        arrays = self.cached_clusters(
-            lambda: Ladder.build(
-                self.clusters, self.data.numpy(), self.epsilon, limit, triangles_of
-            )
-        )
+
+        def build_ladder() -> dict[str, np.ndarray]:
+            return Ladder.build(self.clusters, self.data.numpy(), self.epsilon, limit, triangles_of)
+
+        arrays = self.cached(build_ladder, self.epsilon, self.threshold)
         self.ladder, self.vertices = None, quads_alone
         if len(arrays["thresholds"]):
             self.ladder = Ladder(self.clusters, arrays)
@@ -553,19 +553,16 @@ class ClusteredManifold(Manifold):
             radii = kernel.reach_u * kernel.reach_v
         else:  # the principal ones, of a rotated footprint
             radii = REACH[self.kernel] ** 2 * kernel.sigma_u_given_v * kernel.sigma_v
-        few = kernel.touched_quads() <= manifold.FEW_QUADS
+        few = kernel.touched_quads() <= FEW_QUADS
         return dr.select(few, 0, self.ladder.rung(radii * self.threshold))
 
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """D(m), the density of projected normals over the unit disk; 0 outside of it.
-
-        ``footprint``: a :class:`~.Footprint`, in the UV space of the map.
-        """
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
+        """D(m), the density of projected normals over the unit disk; 0 outside of it."""
         if self.ladder is None:
-            return super().eval(m, footprint, active)
-        kernel = self.texel_kernel(footprint)
+            return super()._eval(m, query, active)
+        kernel = self.texel_kernel(query)
         rung = self.rung(kernel)
-        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+        active = active & (dr.squared_norm(m) < 1)
 
         def add(density, row, column, level, corner, active):
             normals = self.element_normals(row, column, level, active)
@@ -576,20 +573,19 @@ class ClusteredManifold(Manifold):
             )
             return density + dr.select(active, side * side * added, 0)
 
-        exact = super().eval(m, footprint, active & (rung == 0))
+        exact = super()._eval(m, query, active & (rung == 0))
         return exact + self.ladder.visit(m, kernel, rung, add, active)
 
-    def sample(
-        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D: the normal n^l at a place drawn from k.
 
-        One that falls outside the disk is an invalid sample, as D is 0 there. ``sample1`` is not
-        needed.
+        ``sample1`` is not needed.
         """
         if self.ladder is None:
-            return super().sample(footprint, sample1, sample2, active)
-        kernel = self.texel_kernel(footprint)
+            return super()._sample(query, sample1, sample2, active)
+        kernel = self.texel_kernel(query)
         u = kernel.mean + kernel.sample(sample2)
         x, y = floor_int(u.x), floor_int(u.y)
         row, column = self.clusters.y.locate(y)[1], self.clusters.x.locate(x)[1]
@@ -604,7 +600,6 @@ class ClusteredManifold(Manifold):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)
 
-    @property
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, exact and clustered, bytes."""
-        return {**super().parts, "clusters": 0 if self.ladder is None else self.ladder.nbytes}
+        return {**super().parts(), "clusters": 0 if self.ladder is None else self.ladder.nbytes}

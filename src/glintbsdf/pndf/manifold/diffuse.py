@@ -11,9 +11,10 @@ from math import pi
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.filters.moments import MomentPyramid
-from glintbsdf.pndf.manifold.exact import TexelMesh
+from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import LOWEST, ProjectedArea
 
 
@@ -36,11 +37,15 @@ class FacetDiffuse:
         """Follow a change of the mesh's data."""
         self.area.parameters_changed()
 
-    def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
+    def eval(self, wi, wo, mode: mi.TransportMode, query: Query, active: mi.Bool) -> mi.Float:
         """``f_d cosθ_o``. The light is at ``wo``, or at ``wi`` where importance is transported."""
         if mode == mi.TransportMode.Importance:
-            return self.area.eval(wi, footprint, active) * wo.z / (pi * wi.z)
-        return self.area.eval(wo, footprint, active) / pi
+            return self.area.eval(wi, query, active) * wo.z / (pi * wi.z)
+        return self.area.eval(wo, query, active) / pi
+
+    def parts(self) -> dict[str, int]:
+        """Memory of each part, besides the mesh, bytes."""
+        return {}
 
     def __repr__(self) -> str:
         return "manifold"
@@ -56,18 +61,15 @@ class OrenNayarDiffuse:
 
     Args:
         mesh (TexelMesh): gives the normals; its triangles play no part.
-        reach (Reach): what will be asked for, see ``MomentPyramid``.
-
-    Attributes:
-        parts (dict[str, int]): memory of each part, bytes.
+        domain (Domain): what will be asked for, see ``MomentPyramid``.
     """
 
-    def __init__(self, mesh: TexelMesh, reach: Reach | None = None) -> None:
-        self.mesh, self.reach = mesh, reach
+    def __init__(self, mesh: TexelMesh, domain: Domain | None = None) -> None:
+        self.mesh, self.domain = mesh, domain
         self.parameters_changed()
 
-    @property
     def parts(self) -> dict[str, int]:
+        """Memory of each part, besides the mesh, bytes."""
         return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.pyramid.nbytes}
 
     def parameters_changed(self) -> None:
@@ -76,16 +78,16 @@ class OrenNayarDiffuse:
             self.mesh.data,
             self.mesh.normal_map.wrap_mode,
             slope_moments,
-            reach=self.reach,
+            domain=self.domain,
         )
 
-    def eval(self, wi, wo, mode: mi.TransportMode, footprint, active) -> mi.Float:
+    def eval(self, wi, wo, mode: mi.TransportMode, query: Query, active: mi.Bool) -> mi.Float:
         """``f cosθ_o``; zero where either direction is below the mean facet.
 
         The model is reciprocal about the mean normal, but cosθ_o is that to the surface, as inside
         ``normalmap``: where importance is transported, directions change places.
         """
-        x, y, slope_x, slope_y, squared = self.pyramid.average(footprint)
+        x, y, slope_x, slope_y, squared = self.pyramid.average(query)
         variance = 0.5 * dr.maximum(squared - slope_x * slope_x - slope_y * slope_y, 0)
         frame = mi.Frame3f(mi.Normal3f(x, y, dr.safe_sqrt(1 - x * x - y * y)))
         local_i, local_o = frame.to_local(wi), frame.to_local(wo)

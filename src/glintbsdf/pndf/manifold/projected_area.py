@@ -34,6 +34,7 @@ are sorted by normal, do not apply. See :class:`ProjectedArea`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import drjit as dr
@@ -41,12 +42,14 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.hashing import pcg3d
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel, difference_of_products
 from glintbsdf.footprint.lattice import Lattice, floor_int
-from glintbsdf.microfacet.frame import SmithMasking
+from glintbsdf.footprint.query import Query
+from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.pndf.filters.moments import MomentPyramid
-from glintbsdf.pndf.manifold.exact import TexelMesh, add_where, cross, triangles_of_quad
+from glintbsdf.pndf.manifold.mesh import TexelMesh, add_where, cross, triangles_of_quad
 
 #: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
 HORIZON = 1e-15
@@ -344,16 +347,22 @@ class FootprintArea:
     mesh: TexelMesh
     few: int
 
-    def eval(self, w: mi.Vector3f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+    def eval(
+        self, w: mi.Vector3f, query: Query | Footprint, active: bool | mi.Bool = True
+    ) -> mi.Float:
         """P(ω) ≥ 0 for a unit vector with ω_z ≥ 0; at most ω_z + the mean slope's length.
 
-        ``footprint``: a :class:`~.Footprint`, in the UV space of the map.
+        ``query``: a query, or just a footprint in the UV space of the map.
         """
-        return self.areas([w], footprint, active)[0]
+        return self.areas([w], Query.of(query), mi.Bool(active))[0]
 
-    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
+    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
         """As :meth:`eval` for several directions, which share what is found under the footprint."""
         raise NotImplementedError
+
+    def parts(self) -> dict[str, int]:
+        """Memory of each part, besides the mesh, bytes."""
+        return {}
 
 
 class ProjectedArea(FootprintArea):
@@ -394,9 +403,8 @@ class ProjectedArea(FootprintArea):
         """The effective triangles of a stored quad, each as first corner and two edges."""
         return triangles_of_quad(self.mesh.quad_normals(row, column, active), self.mesh.epsilon)
 
-    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
-        kernel = self.mesh.texel_kernel(footprint)
-        active = mi.Bool(active)
+    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
+        kernel = self.mesh.texel_kernel(query)
         few = kernel.touched_quads() <= self.few
         by_points = mean_over_points(self.mesh, kernel, directions, active & few)
         by_triangles = self.mean_over_triangles(directions, kernel, active & ~few)
@@ -635,21 +643,19 @@ class GgxFit(FootprintArea):
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
-        reach (Reach): what will be asked for; None for anything. Levels that no such footprint
+        domain (Domain): what will be asked for; None for anything. Levels that no such footprint
             needs are left out.
 
     Attributes:
         pyramid (MomentPyramid): None where all footprints see :func:`mean_over_points`.
-        parts (dict[str, int]): memory of each part, bytes.
     """
 
     few = FINE_QUADS
 
-    def __init__(self, mesh: TexelMesh, reach: Reach | None = None) -> None:
-        self.mesh, self.reach = mesh, reach
+    def __init__(self, mesh: TexelMesh, domain: Domain | None = None) -> None:
+        self.mesh, self.domain = mesh, domain
         self.parameters_changed()
 
-    @property
     def parts(self) -> dict[str, int]:
         if self.pyramid is None:
             return {}
@@ -659,7 +665,7 @@ class GgxFit(FootprintArea):
     def parameters_changed(self) -> None:
         """Fit anew to the data of the mesh."""
         self.pyramid = None
-        if self.reach is not None and self.reach.most_quads <= self.few:
+        if self.domain is not None and self.domain.most_quads <= self.few:
             return
         self.pyramid = MomentPyramid(
             self.mesh.data,
@@ -667,17 +673,16 @@ class GgxFit(FootprintArea):
             None,
             over_quad=partial(grazing_areas, epsilon=self.mesh.epsilon),
             finish=fit,
-            reach=self.reach,
+            domain=self.domain,
         )
 
-    def areas(self, directions: list, footprint, active: bool | mi.Bool = True) -> list:
-        kernel = self.mesh.texel_kernel(footprint)
-        active = mi.Bool(active)
+    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
+        kernel = self.mesh.texel_kernel(query)
         fine = kernel.touched_quads() <= self.few
         by_points = mean_over_points(self.mesh, kernel, directions, active & fine)
         if self.pyramid is None:
             return by_points
-        slope_x, slope_y, xx, xy, yy = self.pyramid.average(footprint, active & ~fine)
+        slope_x, slope_y, xx, xy, yy = self.pyramid.average(query, active & ~fine)
         areas = []
         for w, mean_of_points in zip(directions, by_points, strict=True):
             leaning = dr.fma(slope_x, w.x, slope_y * w.y)
@@ -686,13 +691,8 @@ class GgxFit(FootprintArea):
             areas.append(dr.select(fine, mean_of_points, ggx_area(w.z + leaning, rough)))
         return areas
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the pyramid, bytes."""
-        return self.pyramid.nbytes
-
     def __repr__(self) -> str:
-        return f"ggx_fit[{self.nbytes / 2**20:.1f} MiB]"
+        return f"ggx_fit[{sum(self.parts().values()) / 2**20:.1f} MiB]"
 
 
 def azimuths() -> list[tuple[float, float]]:
@@ -786,14 +786,16 @@ class ProjectedAreaMasking(SmithMasking):
         super().__init__(height_correlated)
         self.area = area
 
-    parts = property(lambda self: getattr(self.area, "parts", {}))
+    def parts(self) -> dict[str, int]:
+        return self.area.parts()
 
-    def parameters_changed(self) -> None:
-        self.area.parameters_changed()
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        if not keys or "data" in keys:
+            self.area.parameters_changed()
 
-    def smith_lambdas(self, directions: list, footprint, active: mi.Bool) -> list:
-        areas = self.area.areas(directions, footprint, active)
-        by_points = self.area.mesh.texel_kernel(footprint).touched_quads() <= self.area.few
+    def smith_lambdas(self, directions: list, query: Query, active: mi.Bool) -> list:
+        areas = self.area.areas(directions, query, active)
+        by_points = self.area.mesh.texel_kernel(query).touched_quads() <= self.area.few
         scale = dr.select(by_points, 1 + MISSED, 1)
         return [
             scale * dr.maximum(area / dr.maximum(w.z, 1e-12) - 1, 0)
@@ -802,3 +804,12 @@ class ProjectedAreaMasking(SmithMasking):
 
     def __repr__(self) -> str:
         return f"{self.area}, height_correlated = {self.height_correlated}"
+
+
+def area(name: str, mesh: TexelMesh, domain: Domain | None) -> FootprintArea | None:
+    """The estimate of P that a masking of this name uses; None for one that uses none."""
+    if name == "ggx_fit":
+        return GgxFit(mesh, domain)
+    if name == "analytic":
+        return ProjectedArea(mesh)
+    return None

@@ -368,7 +368,6 @@ class NormalTables:
     """
 
     EMPTY = 0xFFFFFFFF
-    VERSION = 5
 
     def __init__(self, arrays: dict[str, np.ndarray], periods: tuple[int, int]) -> None:
         self.bins, self.periods = Bins(arrays["bounds"]), periods

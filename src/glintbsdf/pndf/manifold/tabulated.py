@@ -24,18 +24,28 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
-from glintbsdf.footprint.domain import Reach
+from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
 from glintbsdf.footprint.lattice import floor_int
+from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
-from glintbsdf.pndf.manifold.exact import Manifold, normal_in_quad
+from glintbsdf.pndf.base import register
+from glintbsdf.pndf.manifold.exact import Manifold
+from glintbsdf.pndf.manifold.mesh import normal_in_quad
 from glintbsdf.pndf.manifold.table_error import MAX_NARROWING, VARIANCE, predicted, widest
 from glintbsdf.pndf.manifold.tables import MIN_SPACING, TWO_THIRDS, NormalTables
 
 
+@register(
+    "tables",
+    title="manifold, tables",
+    plugin="glint_manifold",
+    options={"max_error": 0.05},
+    settings={"max_error": 0.05},
+)
 class TabulatedManifold(Manifold):
     """The manifold, exact for small footprints, by tables beyond; arguments as for ``Manifold``.
 
@@ -46,7 +56,7 @@ class TabulatedManifold(Manifold):
             measured, averaged over three places, is 0.63 to 0.96 of it on six kinds of maps, 0.45
             to 0.95 for kernels with an edge, up to 1.2 at a single place (``benchmarks/tables.py
             --errors``). Footprints so small that it would be larger are evaluated exactly.
-        reach: as for :class:`Manifold`; there are no tables where all footprints are exact.
+        domain: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
     A map with ``wrap_mode`` ``clamp`` is always evaluated exactly, and so is one whose data carry
     derivatives: the tables have some with respect to the footprint, but none with respect to the
@@ -62,7 +72,7 @@ class TabulatedManifold(Manifold):
         epsilon: float = 1e-6,
         max_error: float = 0.05,
         owner: str = "TabulatedManifold",
-        reach: Reach | None = None,
+        domain: Domain | None = None,
     ) -> None:
         check(
             max_error > 0 and np.isfinite(max_error),
@@ -72,28 +82,29 @@ class TabulatedManifold(Manifold):
             max_error,
         )
         self.max_error = float(max_error)
-        key = f"tables {NormalTables.VERSION} {normal_map.content_hash} {epsilon!r}"
-        self.cached_tables = lambda build: load_or_build(key, build)
-        super().__init__(normal_map, kernel, epsilon, owner, reach)
-        self.cached_tables = lambda build: build()
+        super().__init__(normal_map, kernel, epsilon, owner, domain)
 
-    def build(self) -> None:
-        """Make everything that depends on ``self.data``; the cache may know lists and tables."""
-        super().build()
+    def build(self, domain: Domain | None = None) -> None:
+        """Make lists and tables for queries within ``domain``; the cache may know them."""
+        super().build(domain)
         self.tables = None
         differentiated = dr.grad_enabled(self.data)
         if self.normal_map.wrap_mode != "clamp" and self.may_use_tables() and not differentiated:
-            arrays = self.cached_tables(
-                lambda: NormalTables.build(self.lattice, self.effective_triangles, self.bounds())
+            self.tables = NormalTables(
+                self.cached(self.build_tables, self.epsilon),
+                (self.lattice.y.quads, self.lattice.x.quads),
             )
-            self.tables = NormalTables(arrays, (self.lattice.y.quads, self.lattice.x.quads))
+
+    def build_tables(self) -> dict[str, np.ndarray]:
+        """The arrays of the tables."""
+        return NormalTables.build(self.lattice, self.effective_triangles, self.normal_bounds())
 
     def may_use_tables(self) -> bool:
-        """Whether any footprint within the reach has room for the closest nodes there could be."""
-        if self.reach is None:
+        """Whether any footprint within the domain has room for the closest nodes there could be."""
+        if self.domain is None:
             return True
         closest = min(MIN_SPACING, max(self.lattice.y.quads, self.lattice.x.quads))
-        return closest <= widest(self.kernel) * self.reach.largest
+        return closest <= widest(self.kernel) * self.domain.largest
 
     def error(self, kernel: TexelKernel, level: int) -> mi.Float:
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
@@ -108,7 +119,7 @@ class TabulatedManifold(Manifold):
 
         The truth spreads every triangle over the bins, weighed by the kernel at its quad's centre.
         """
-        kernel, bins = self.texel_kernel(footprint), self.tables.bins
+        kernel, bins = self.texel_kernel(Query.of(footprint)), self.tables.bins
         (mean,) = np.array(mi.Vector2f(kernel.mean)).T
         reach = np.array(dr.ravel(mi.Vector2f(kernel.reach_u, kernel.reach_v)))
         first, last = (np.floor(mean + sign * reach).astype(int) for sign in (-1, 1))
@@ -125,9 +136,13 @@ class TabulatedManifold(Manifold):
         masses = self.eval(every_bin, footprint).numpy().astype(np.float64) * bins.area
         return float(np.abs(masses - truth / truth.sum()).sum())
 
-    def level(self, footprint) -> mi.Int:
+    def level(self, query: Query | Footprint) -> mi.Int:
         """The coarsest level of nodes that keeps the error, −1 where none does."""
-        kernel = self.texel_kernel(footprint)
+        query = Query.of(query)
+        return query.once((self, "level"), lambda: self.find_level(self.texel_kernel(query)))
+
+    def find_level(self, kernel: TexelKernel) -> mi.Int:
+        """The level for a kernel, see :meth:`level`."""
         level = mi.Int(-1)
         for k, variances in enumerate(self.tables.variances):
             room = max(variances) <= MAX_NARROWING * VARIANCE[self.kernel] * kernel.minor_variance
@@ -140,12 +155,26 @@ class TabulatedManifold(Manifold):
         index = mi.UInt32(dr.maximum(level, 0))
         return [dr.gather(mi.Int, n, index) for n in (self.tables.count_y, self.tables.count_x)]
 
-    def node_kernel(self, footprint, level) -> TexelKernel:
-        """The footprint's kernel on the lattice of a level, in units of the nodes' distance.
+    def relative_error(self, query) -> mi.Float:
+        """The relative L1 error predicted for the level that a query uses; 0 where it is exact."""
+        query = Query.of(query)
+        if self.tables is None:
+            return mi.Float(0)
+        kernel, used, error = self.texel_kernel(query), self.level(query), mi.Float(0)
+        for level in range(len(self.tables.counts)):
+            error = dr.select(used == level, self.error(kernel, level), error)
+        return error
+
+    def node_kernel(self, query: Query) -> TexelKernel:
+        """The footprint's kernel on the lattice of its level, in units of the nodes' distance.
 
         It is narrower, by the variance that the functions of the nodes add.
         """
-        tables = self.tables
+        return query.once((self, "node kernel"), lambda: self.make_node_kernel(query))
+
+    def make_node_kernel(self, query: Query) -> TexelKernel:
+        """What :meth:`node_kernel` returns."""
+        tables, level = self.tables, self.level(query)
         nodes = [
             mi.Float(n) / p for n, p in zip(self.counts_of(level), tables.periods, strict=True)
         ]
@@ -158,7 +187,7 @@ class TabulatedManifold(Manifold):
         per_texel = mi.Vector2f(nodes[1], nodes[0])
         kernel = TexelKernel(
             self.kernel,
-            footprint,
+            query.footprint,
             height * nodes[0],
             width * nodes[1],
             self.normal_map.wrap_mode,
@@ -205,15 +234,15 @@ class TabulatedManifold(Manifold):
             state, lambda *state: state[3], body, max_iterations=-1, label="every node"
         )[4:]
 
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
-        """D(m), see :meth:`Manifold.eval`: piecewise constant over bins where tables are used."""
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
+        """D(m), see :class:`Manifold`: piecewise constant over bins where tables are used."""
         if self.tables is None:
-            return super().eval(m, footprint, active)
-        level = self.level(footprint)
-        exact = super().eval(m, footprint, mi.Bool(active) & (level < 0))
+            return super()._eval(m, query, active)
+        level = self.level(query)
+        exact = super()._eval(m, query, active & (level < 0))
 
-        tables, kernel = self.tables, self.node_kernel(footprint, level)
-        row, found = tables.row(m, mi.Bool(active) & (level >= 0) & (dr.squared_norm(m) < 1))
+        tables, kernel = self.tables, self.node_kernel(query)
+        row, found = tables.row(m, active & (level >= 0) & (dr.squared_norm(m) < 1))
         table = tables.table(mi.UInt32(dr.maximum(level, 0)), row, found)
         count_y, count_x = self.counts_of(level)
 
@@ -229,20 +258,19 @@ class TabulatedManifold(Manifold):
         mass, total = self.every_node(kernel, found, add, mi.Float(0), mi.Float(0))
         return exact + dr.select(found & (total > 0), mass / (total * tables.bins.area), 0)
 
-    def sample(
-        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """Draw a projected normal with the density that :meth:`eval` gives."""
-        exact = super().sample(footprint, sample1, sample2, active)
+        """Draw a projected normal with the density that :meth:`_eval` gives."""
+        exact = super()._sample(query, sample1, sample2, active)
         if self.tables is None:
             return exact
-        level = self.level(footprint)
-        return dr.select(level < 0, exact, self.sample_tables(footprint, level, sample2, active))
+        return dr.select(self.level(query) < 0, exact, self.draw_table(query, sample2, active))
 
-    def sample_tables(self, footprint, level, sample2, active) -> mi.Vector2f:
+    def draw_table(self, query: Query, sample2: mi.Point2f, active: mi.Bool) -> mi.Vector2f:
         """A node by its weight, a place under its spline, the normal there, a place in its bin."""
-        kernel = self.node_kernel(footprint, level)
-        active = mi.Bool(active) & (level >= 0)
+        kernel, level = self.node_kernel(query), self.level(query)
+        active = active & (level >= 0)
 
         # More numbers than the two given are wanted: hashed from them.
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y)]
@@ -286,10 +314,9 @@ class TabulatedManifold(Manifold):
         index, _ = self.tables.bins.index(m)
         return self.tables.bins.normal(index, mi.Vector2f(bin_x, bin_y))
 
-    @property
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
-        return {**super().parts, "tables": 0 if self.tables is None else self.tables.nbytes}
+        return {**super().parts(), "tables": 0 if self.tables is None else self.tables.nbytes}
 
 
 def wrapped(index, count):

@@ -35,9 +35,6 @@ SMALLEST_GRID = 12
 #: Iterations of k-means.
 ITERATIONS = 8
 
-#: Of what :func:`build` returns; part of the cache's key.
-VERSION = 4
-
 
 @dataclass
 class Lobes:

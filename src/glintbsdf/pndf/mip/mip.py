@@ -13,8 +13,7 @@ paper's Eq. 9 the weights have changed places.
 
 from __future__ import annotations
 
-import warnings
-from functools import cached_property
+from collections.abc import Sequence
 from math import inf, log2, pi
 
 import drjit as dr
@@ -22,20 +21,22 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.cache import load_or_build
-from glintbsdf.core.errors import check, check_whole
+from glintbsdf.core.errors import check, check_whole, warn
 from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
-from glintbsdf.maps.normalmap import NormalMap
-from glintbsdf.maps.quilting import VERSION as MAP_VERSION
+from glintbsdf.footprint.query import Query
+from glintbsdf.maps.normalmap import MapShape, NormalMap
 from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
+from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
-from glintbsdf.pndf.manifold.exact import add_where
+from glintbsdf.pndf.manifold.mesh import add_where
 from glintbsdf.pndf.mip import levels as lobe_levels
-from glintbsdf.pndf.mip import packing as packed_lobes
 from glintbsdf.pndf.mip.cells import Grids
 from glintbsdf.pndf.mip.packing import NORMAL_CUT, Lobe
+from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Width of a footprint in standard deviations, a pixel's by default: its area in Eq. 8 is that of a
 #: square as wide.
@@ -53,7 +54,14 @@ GRID_CUT = 12.25
 PER_TURN = 4
 
 
-class Mip:
+@register(
+    "mip",
+    title="MIP-mapped lobes",
+    plugin="glint_mip",
+    options={"output_size": 512, "patch_size": 32},
+    settings={"output_size": 512, "patch_size": 32},
+)
+class Mip(PNDF):
     """P-NDF of a large map synthesised from a sample (Tan et al. 2022).
 
     Belongs to the variant of Mitsuba that is active when it is made. The unit square of UV is the
@@ -81,9 +89,6 @@ class Mip:
 
     Raises :class:`~.ParameterError`.
     """
-
-    #: For references: the footprint is a Gaussian, and no triangle is clamped.
-    kernel, epsilon = "gaussian", 0.0
 
     def __init__(
         self,
@@ -117,36 +122,30 @@ class Mip:
         self.sigma_r = mi.Float(sigma_r)
         check_sigma_r(owner, sigma_r)
         self.data = mi.TensorXf(normal_map.normals)
-        self.build(normal_map)
+        self.sample_map = normal_map
+        self.build()
 
-    def build(self, sample: NormalMap) -> None:
-        """Synthesise the map and cluster its lobes; the cache on disk may know them already."""
+    def build(self, domain: Domain | None = None) -> None:
+        """Synthesise the map and cluster its lobes, for any query; the cache on disk may know them
+        already."""
+        sample = self.sample_map
         distinct = len(np.unique(sample.normals.view(np.complex64)))
         if distinct < self.clusters:
-            warnings.warn(
+            warn(
                 f"{self.owner}: the sample has {distinct} distinct normals, fewer than "
-                f'"clusters" = {self.clusters}: lobes that differ in position only are kept apart',
-                stacklevel=2,
+                f'"clusters" = {self.clusters}: lobes that differ in position only are kept apart'
             )
         options = {**self.options, "toroidal": self.wrap_mode == "repeat"}
-        key = " ".join(
-            (
-                f"mip {MAP_VERSION}.{lobe_levels.VERSION}.{packed_lobes.VERSION}",
-                sample.content_hash,
-                *(f"{name}={value!r}" for name, value in options.items()),
-                f"{self.clusters} {self.normal_weight}",
-            )
-        )
 
-        def build() -> dict:
+        def build_levels() -> dict[str, np.ndarray]:
             synthesis = synthesise(sample, **options, owner=self.owner)
             levels = lobe_levels.build(
                 synthesis, self.clusters, self.normal_weight, self.options["seed"]
             )
             return {**synthesis.arrays(), **levels}
 
-        arrays = load_or_build(key, build)
-        self.__dict__.pop("normal_map", None)
+        key = (sample.content_hash, *options.items(), self.clusters, self.normal_weight)
+        arrays = load_or_build(build_levels, *key)
         self.synthesis = Synthesis.from_arrays(
             sample.normals, self.options["output_size"], self.options["overlap"], arrays
         )
@@ -164,7 +163,12 @@ class Mip:
     #  Section 5.2.1: levels and lobes
     # --------------------------------------------------------------------------------------------
 
-    def texel_kernel(self, footprint, added: mi.Float | None = None) -> TexelKernel:
+    def texel_kernel(self, query: Query | Footprint) -> TexelKernel:
+        """The footprint on the map's texels."""
+        query = Query.of(query)
+        return query.once((self, "kernel"), lambda: self.make_kernel(query.footprint))
+
+    def make_kernel(self, footprint: Footprint, added: mi.Float | None = None) -> TexelKernel:
         """The footprint on the map's texels, widened by the variance ``added`` (texels²)."""
         size = self.synthesis.size
         added = SIGMA_MIN**2 if added is None else added + SIGMA_MIN**2
@@ -205,7 +209,7 @@ class Mip:
             # stands between this texel and the next; in a mirror image, the one before.
             texels = level == 0
             width, shift = (SIGMA_H + 0.5 / 3, 0.0) if mirrored else (SIGMA_H, 0.5)
-            reach = self.texel_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
+            reach = self.make_kernel(footprint, dr.select(texels, mi.Float(width**2), 0))
             reach.cut_at(dr.select(texels, dr.sqrt(self.texel_cut(kernel)), REACH["gaussian"]))
             centre = mi.Vector2f(reach.mean) + dr.select(texels, 0.5 - shift, 0.5)
             axis = grids.axis.on(level, active)
@@ -297,13 +301,13 @@ class Mip:
     #  Section 5.2.2: evaluation and sampling
     # --------------------------------------------------------------------------------------------
 
-    def eval(self, m: mi.Vector2f, footprint, active: bool | mi.Bool = True) -> mi.Float:
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 9); 0 outside of it.
 
-        ``footprint``: a :class:`~.Footprint`, in the UV space of the large map.
+        The query's footprint is given in the UV space of the large map.
         """
-        kernel = self.texel_kernel(footprint)
-        active = mi.Bool(active) & (dr.squared_norm(m) < 1)
+        kernel, footprint = self.texel_kernel(query), query.footprint
+        active = active & (dr.squared_norm(m) < 1)
         below, above, fraction = self.level(kernel)
         density = self.level_density(m, footprint, kernel, below, active)
         blended = active & (fraction > 0)
@@ -360,16 +364,15 @@ class Mip:
         mass = lattice_mass(mi.Vector2f(kernel.mean) + 0.5, xx, second.x * second.y, yy)
         return 2 * pi * mass_under_fade(self.texel_cut(kernel)) * mass
 
-    def sample(
-        self, footprint, sample1, sample2: mi.Point2f, active: bool | mi.Bool = True
+    def _sample(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D: a level, a lobe of it, a normal of the lobe.
 
         The lobe is chosen by a weighted reservoir: the next one takes the place of the last with
-        probability weight/total so far. One that falls outside the disk is an invalid sample.
+        probability weight/total so far.
         """
-        kernel = self.texel_kernel(footprint)
-        active = mi.Bool(active)
+        kernel, footprint = self.texel_kernel(query), query.footprint
         below, above, fraction = self.level(kernel)
         bits, name, _ = pcg3d(dr.reinterpret_array(mi.UInt32, mi.Float(sample1)), 0, 0)
         level = dr.select(uniform(bits) < fraction, above, below)
@@ -413,21 +416,38 @@ class Mip:
         callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check what has changed; a new sample makes everything anew."""
         check_sigma_r(self.owner, self.sigma_r[0])
         if not keys or "data" in keys:
-            self.build(NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data"))
+            self.sample_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+            self.build()
 
-    @cached_property
-    def normal_map(self) -> NormalMap:
-        """The large map, for references: as large as what is saved by not storing it."""
-        return self.synthesis.normal_map()
+    def smooth(self) -> SmoothBeckmann:
+        return SmoothBeckmann(
+            lambda: smooth_alpha(self.alpha_squared(), self.sigma_r),
+            self.roughness_keys,
+            self.owner,
+        )
 
     @property
-    def nbytes(self) -> int:
-        """Memory of lobes and look-up tables, bytes."""
-        return 4 * dr.width(self.words) + self.grids.nbytes
+    def shape(self) -> MapShape:
+        """Size and wrap mode of the large map."""
+        return MapShape(self.synthesis.size, self.synthesis.size, self.wrap_mode)
+
+    @property
+    def normal_map(self) -> NormalMap:
+        """The large map, made anew whenever it is asked for: it is for references and plots, and as
+        large as what is saved by not storing it."""
+        return self.synthesis.normal_map()
+
+    def parts(self) -> dict[str, int]:
+        """Memory of sample, lobes and look-up tables, bytes."""
+        return {
+            "sample": self.sample_map.nbytes + 4 * dr.width(self.data),
+            "lobes": 4 * dr.width(self.words),
+            "grids": self.grids.nbytes,
+        }
 
     def __repr__(self) -> str:
         return (

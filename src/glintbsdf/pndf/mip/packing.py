@@ -25,15 +25,12 @@ import numpy as np
 
 from glintbsdf.pndf.elements.elements import FADE
 from glintbsdf.pndf.gaussian_elements import Gaussian
-from glintbsdf.pndf.manifold.exact import cross
+from glintbsdf.pndf.manifold.mesh import cross
 
 #: Standard deviations of a lobe's normals beyond which they are left out: 1.5e-4 of the mass at
 #: most, be it that all lobes spread normals alike in both directions, or that a footprint sees each
 #: at its rim, where its mean is as far off as the footprint is.
 NORMAL_CUT = 4.2
-
-#: Version of the format, part of the keys of caches.
-VERSION = 2
 
 
 def factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

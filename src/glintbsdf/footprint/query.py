@@ -1,0 +1,91 @@
+"""A query: everything that one evaluation of a glint BSDF asks of its P-NDF.
+
+The BSDF's base class makes one query per evaluation and hands it to the density, the sampler, the
+masking and whatever stands between them. All of them share what it carries, and what any of them
+derives from it.
+
+**The footprint** says where on the map we look, and how far around.
+
+**The turn** H of the half vector. Over a footprint the half vector is not constant: the surface is
+curved, the camera and the light are near. To first order its projection is s(u) = s₀ + H (u − u₀).
+What is wanted is then ``∫ k(u) δ(n(u) − s(u)) du``, the P-NDF of the field n(u) − H (u − u₀): every
+Jacobian J of the map becomes J − H.
+
+**The spread** Σ in normal space. Under a light of some extent the half vector covers a region
+around s₀. The P-NDF is averaged over a Gaussian of this covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from typing import TypeVar
+
+import mitsuba as mi
+
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import SIGMA_MIN, TexelKernel
+
+T = TypeVar("T")
+
+
+class Query:
+    """One question to a P-NDF.
+
+    Args:
+        footprint (Footprint): mean and axes in the UV space of the map.
+        turn (mi.Matrix2f): H = ∂s/∂u of the half vector's projection, per unit of UV; None where
+            the half vector counts as constant.
+        spread: vectors v (``mi.Vector2f``) whose products v vᵀ add up to the covariance Σ of
+            projected normals over which D is averaged; none for no average.
+        parameters: parameters of the P-NDF at the surface point, by name, that take the place of
+            its own: those that have a texture.
+    """
+
+    def __init__(
+        self,
+        footprint: Footprint,
+        turn: mi.Matrix2f | None = None,
+        spread: tuple[mi.Vector2f, ...] = (),
+        parameters: Mapping[str, object] | None = None,
+    ) -> None:
+        self.footprint, self.turn, self.spread = footprint, turn, tuple(spread)
+        self.parameters = dict(parameters or {})
+        self._derived: dict[Hashable, object] = {}
+
+    @staticmethod
+    def of(question: Query | Footprint) -> Query:
+        """A query as it is, or the plain query of a footprint."""
+        return question if isinstance(question, Query) else Query(question)
+
+    def at(self, footprint: Footprint) -> Query:
+        """The same query with another footprint."""
+        return Query(footprint, self.turn, self.spread, self.parameters)
+
+    def parameter(self, name: str, default: T) -> T:
+        """A parameter of the P-NDF: its value at the surface point, or ``default`` everywhere."""
+        return self.parameters.get(name, default)  # type: ignore[return-value]
+
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make()`` returns, made when it is first asked for.
+
+        ``key`` must tell all that ``make`` depends on besides the query. What is returned is shared
+        and must not be changed. Do not call this inside the body of a recorded loop or branch: what
+        is made there does not exist outside.
+        """
+        if key not in self._derived:
+            self._derived[key] = make()
+        return self._derived[key]  # type: ignore[return-value]
+
+    def texel_kernel(
+        self,
+        kernel: str,
+        height: int,
+        width: int,
+        wrap_mode: str,
+        added: tuple[float, float] = (SIGMA_MIN**2, SIGMA_MIN**2),
+    ) -> TexelKernel:
+        """The footprint's kernel on a map of this size; see :class:`~.TexelKernel`."""
+        return self.once(
+            ("kernel", kernel, height, width, wrap_mode, added),
+            lambda: TexelKernel(kernel, self.footprint, height, width, wrap_mode, added),
+        )

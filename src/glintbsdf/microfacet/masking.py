@@ -1,0 +1,106 @@
+"""Masking and shadowing of facets.
+
+Directions are unit vectors of the upper hemisphere in the local shading frame.
+
+Source: Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 2014.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi, sqrt
+
+import drjit as dr
+import mitsuba as mi
+
+from glintbsdf.footprint.query import Query
+
+
+class SmithMasking:
+    """Smith's masking and shadowing, from the function Λ that a subclass gives (Heitz 2014).
+
+    Args:
+        height_correlated: Whether masking and shadowing count a facet's height once,
+            ``1 / (1 + Λ(wi) + Λ(wo))``, rather than as independent events,
+            ``G1(wi) G1(wo)`` (Heitz 2014, on the joint masking-shadowing function).
+    """
+
+    def __init__(self, height_correlated: bool = True) -> None:
+        self.height_correlated = height_correlated
+
+    def smith_lambda(self, w: mi.Vector3f, query: Query, active: mi.Bool) -> mi.Float:
+        """Λ(w) ≥ 0 of the facets under the footprint, such that ``G1(w) = 1 / (1 + Λ(w))``."""
+        return self.smith_lambdas([w], query, active)[0]
+
+    def smith_lambdas(self, directions: list, query: Query, active: mi.Bool) -> list:
+        """As :meth:`smith_lambda` for several directions. A subclass overrides either of the two:
+        this one where directions share what is found under the footprint."""
+        return [self.smith_lambda(w, query, active) for w in directions]
+
+    def eval(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        query: Query,
+        mode: mi.TransportMode,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """The factor G in [0, 1] for two directions of the upper hemisphere.
+
+        ``mode``: what is transported along ``wi``; Smith's factor is the same for both.
+        """
+        lambda_i, lambda_o = self.smith_lambdas([wi, wo], query, active)
+        if self.height_correlated:
+            return dr.rcp(1 + lambda_i + lambda_o)
+        return dr.rcp((1 + lambda_i) * (1 + lambda_o))
+
+    def parts(self) -> dict[str, int]:
+        """Memory of each part of what it has built, bytes."""
+        return {}
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Rebuild what depends on the parameters named, on all of them where none is."""
+
+
+class BeckmannMasking(SmithMasking):
+    """Masking of a Beckmann surface.
+
+    Args:
+        alpha_squared: function that returns an ``mi.Vector2f``, squared roughness along u and v. It
+            is asked again when one of ``keys`` has changed.
+        height_correlated: see :class:`SmithMasking`.
+        keys: names of the parameters on which the roughness depends.
+    """
+
+    def __init__(self, alpha_squared, height_correlated: bool = True, keys=("data",)) -> None:
+        super().__init__(height_correlated)
+        self.current, self.keys = alpha_squared, frozenset(keys)
+        self.alpha_squared = alpha_squared()
+
+    def smith_lambda(self, w, query, active):
+        return beckmann_lambda(w, self.alpha_squared)
+
+    def parameters_changed(self, keys=()):
+        if not keys or self.keys & set(keys):
+            self.alpha_squared = self.current()
+
+    def __repr__(self) -> str:
+        alpha_u, alpha_v = (sqrt(x[0]) for x in self.alpha_squared)
+        return (
+            f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
+            f"height_correlated = {self.height_correlated}]"
+        )
+
+
+def beckmann_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:
+    """Λ(w) of an anisotropic Beckmann surface (Heitz 2014); 0 for a flat one.
+
+    ``Λ = (exp(−a²) / (a √π) − erfc(a)) / 2`` with ``a = cosθ / √(α_u² w_x² + α_v² w_y²)``.
+    """
+    tangent_squared = alpha_squared.x * w.x * w.x + alpha_squared.y * w.y * w.y
+    # Beyond a = 4, Λ is below 3e-10: float32 sees none of it, and a flat surface has an infinite a.
+    visible = 16 * tangent_squared > w.z * w.z
+    a = w.z * dr.rsqrt(dr.select(visible, tangent_squared, 1))
+    value = 0.5 * (dr.exp(-a * a) / (a * sqrt(pi)) - (1 - dr.erf(a)))
+    # The two terms cancel as a grows; rounding must not turn G into more than 1.
+    return dr.select(visible, dr.maximum(value, 0), 0)
