@@ -18,8 +18,9 @@ from glintbsdf import __version__
 from glintbsdf.bridge import llvm
 from glintbsdf.check import plot as pndf_plot
 from glintbsdf.cli.doctor import examine
+from glintbsdf.cli.making import Making, Subject, make, parse_image
+from glintbsdf.cli.making import options as making_options
 from glintbsdf.core.interruption import interruptible
-from glintbsdf.core.progress import progress
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.scene import inspection, rendering
@@ -100,16 +101,6 @@ def _parse_definitions(
     return {key: value for key, _, value in pairs}
 
 
-def _parse_output(
-    _context: click.Context, _parameter: click.Parameter, path: Path | None
-) -> Path | None:
-    """Accept only names of image files that can be written."""
-    if path is not None and path.suffix.lower() not in rendering.FORMATS:
-        allowed = " or ".join(rendering.FORMATS)
-        raise click.BadParameter(f'must end in {allowed} (got "{path}")')
-    return path
-
-
 def _parse_exr(_context: click.Context, _parameter: click.Parameter, path: Path) -> Path:
     """Accept only names of OpenEXR files."""
     if path.suffix.lower() != ".exr":
@@ -150,7 +141,7 @@ def _define_option(meaning: str):
     "-o",
     "output",
     type=click.Path(path_type=Path),
-    callback=_parse_output,
+    callback=parse_image,
     help="Image to write, .exr or .png.  [default: SCENE.exr]",
 )
 @_variant_option
@@ -171,6 +162,7 @@ def _define_option(meaning: str):
     "samples finds out. The image is the same.",
 )
 @_define_option("Parameter of the scene; may be repeated.")
+@making_options
 def render(
     scene: Path,
     output: Path | None,
@@ -180,45 +172,18 @@ def render(
     denoise: bool,
     trim: bool,
     definitions: dict[str, str],
+    **how: object,
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
 
-    The footprint of glint BSDFs that leave "pixel_spread" at 0 is that of the camera's pixels.
+    The footprint of glint BSDFs that leave "pixel_spread" at 0 is that of the camera's pixels. The
+    same command gives the same image, to the last bit.
     """
+    where = Making(**how)
     _activate(variant)
-    path = output or scene.with_suffix(".exr")
-    with rendering.replacing(path) as unfinished:
-        trimmed = None
-        # Plugins show the progress of what they build while the scene loads.
-        if trim:
-            inspected = inspection.load(scene, definitions)
-            loaded, trimmed = inspected.scene, inspection.Trimmed(inspected, spp)
-        else:
-            loaded = rendering.load_scene(scene, definitions)
-        missed = trimmed.missed if trimmed else lambda: False
-        with (
-            rendering.Renderer(loaded, spp, denoise, missed) as renderer,
-            progress("Rendering") as report,
-        ):
-            picture, interrupted = _produce(
-                renderer, seed, observe=lambda image: report(image.fraction)
-            )
-        if trimmed and not trimmed.sufficed:
-            click.echo("Trimmed structures did not suffice: built in full.", err=True)
-        rendering.save(picture.bitmap, unfinished)
-    click.echo(path)
-    if interrupted:
-        raise click.ClickException(
-            f"interrupted: {path} has {100 * picture.fraction:.3g} % of the samples"
-        )
-
-
-def _produce(renderer: rendering.Renderer, seed: int, **options) -> tuple[rendering.Picture, bool]:
-    """An image, or what was done of it when Ctrl-C came, and whether it came."""
-    try:
-        return rendering.produce(renderer, seed, **options), False
-    except rendering.Interrupted as interrupt:
-        return interrupt.picture, True
+    subject = Subject(scene, definitions, variant, spp, seed, denoise, trim)
+    with where.cluster(variant) as cluster:
+        make(subject, output or scene.with_suffix(".exr"), where, cluster)
 
 
 @commands.command()
@@ -263,7 +228,7 @@ def inspect(scene: Path, variant: str, spp: int | None, definitions: dict[str, s
     "-o",
     "output",
     type=click.Path(path_type=Path),
-    callback=_parse_output,
+    callback=parse_image,
     default="pndf.png",
     show_default=True,
     help="Drawing to write.",

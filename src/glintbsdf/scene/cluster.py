@@ -1,0 +1,561 @@
+"""Units rendered by many processes, on this machine or on many, through Dask.
+
+A worker is sent a unit and the description of its image. It checks that its versions are the same,
+says which files of the scene it lacks, loads the scene once, and returns the sums of the unit. The
+client holds no more units than workers can be busy with, so neither it nor the scheduler grows with
+the number of units. Dask gives the units of a worker that has died to others; which worker made
+what does not show in the image.
+
+Workers run whatever their scheduler sends: who can reach it can do what the workers can. A local
+cluster listens on loopback only; across machines use TLS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+import warnings
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.footprint.domain import waiting
+from glintbsdf.scene.inspection import Inspected, Trimmed
+from glintbsdf.scene.merging import Results
+from glintbsdf.scene.package import (
+    BadPackage,
+    Content,
+    Job,
+    Store,
+    pieces,
+    version_difference,
+    versions,
+)
+from glintbsdf.scene.passes import Tile
+from glintbsdf.scene.rendering import Renderer
+from glintbsdf.scene.units import Unit
+
+#: Seconds until a scheduler must have answered.
+PATIENCE = 8.0
+
+#: Units under way for each worker: one that it renders, and one that it will.
+AHEAD = 2
+
+#: Scenes that a worker keeps loaded: frames of a sequence follow each other.
+SCENES = 2
+
+#: How often a unit that needs too much memory is halved.
+HALVINGS = 3
+
+
+GONE = "the scheduler is gone; with --checkpoint the same command goes on from what is done"
+
+
+class ClusterError(RuntimeError):
+    """Something is the matter with the scheduler or its workers; the message says what."""
+
+
+# ------------------------------------------------------------------------------------------------
+#  On a worker
+# ------------------------------------------------------------------------------------------------
+
+_lock = threading.RLock()  # Mitsuba's variant and Dr.Jit's threads are those of the process
+_loaded: OrderedDict[Job, tuple[Renderer, ExitStack]] = OrderedDict()
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a worker returns for a unit.
+
+    Attributes:
+        worker (str): its address.
+        missing (tuple[Content, ...]): files that it must be sent first.
+        tile, sums: of the unit, where nothing was missing; see :func:`.sums_of_samples`.
+        trimmed_too_far (bool): structures had to be built in full.
+    """
+
+    worker: str
+    missing: tuple[Content, ...] = ()
+    tile: Tile | None = None
+    sums: np.ndarray | None = None
+    trimmed_too_far: bool = False
+
+
+def work(job: Job, unit: Unit, expected: dict[str, str]) -> Answer:
+    """Render a unit, on a worker.
+
+    Args:
+        expected: versions that the worker must have.
+
+    Raises:
+        ClusterError: it has others, or lacks what the variant needs.
+        MemoryError: it has not enough memory.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    difference = version_difference(expected)
+    if difference is not None:
+        raise ClusterError(f"the worker {worker.address} has {difference}")
+    with _lock:
+        store = Store(Path(worker.local_directory) / "glintbsdf-files")
+        missing = job.package.missing(store) if job not in _loaded else []
+        if missing:
+            return Answer(worker.address, tuple(missing))
+        try:
+            renderer = _renderer(job, store, threads=worker.state.nthreads)
+            tile, sums = renderer.render(unit)
+        except Exception as error:
+            if "out of memory" in str(error).lower() and not isinstance(error, MemoryError):
+                raise MemoryError(str(error)) from None
+            raise
+        return Answer(
+            worker.address, (), tile, sums, trimmed_too_far=not renderer_sufficed(renderer)
+        )
+
+
+def renderer_sufficed(renderer: Renderer) -> bool:
+    """Whether the structures of a renderer, if they are trimmed, have been enough so far."""
+    trimmed = getattr(renderer.missed, "__self__", None)
+    return not isinstance(trimmed, Trimmed) or trimmed.sufficed
+
+
+def _renderer(job: Job, store: Store, threads: int) -> Renderer:
+    """The scene of a job, loaded at its first unit."""
+    if job in _loaded:
+        _loaded.move_to_end(job)
+        return _loaded[job][0]
+    if job.variant not in mi.variants():
+        raise ClusterError(f"a worker's Mitsuba has no variant {job.variant}")
+    while len(_loaded) >= SCENES or (_loaded and mi.variant() != job.variant):
+        _, (_, stack) = _loaded.popitem(last=False)
+        stack.close()
+    if job.variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise ClusterError(f"{job.variant} needs an NVIDIA GPU, and a worker has none")
+    if mi.variant() != job.variant:
+        mi.set_variant(job.variant)
+    with _spare_thread(threads):
+        if job.trim:
+            with waiting() as bsdfs:
+                inspected = Inspected(job.package.load(store), bsdfs)
+            scene, missed = inspected.scene, Trimmed(inspected, job.spp).missed
+        else:
+            scene, missed = job.package.load(store), lambda: False
+    with ExitStack() as stack:
+        renderer = stack.enter_context(Renderer(scene, job.spp, job.denoise, missed))
+        _loaded[job] = renderer, stack.pop_all()
+    return renderer
+
+
+@contextlib.contextmanager
+def _spare_thread(threads: int) -> Iterator[None]:
+    """In the block Dr.Jit has two threads at least, which Mitsuba needs to read OpenEXR files;
+    after it as many as are given."""
+    dr.set_thread_count(max(2, threads))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
+
+
+def receive(content: Content, offset: int, piece: bytes, last: bool, dask_worker=None) -> None:
+    """Take a piece of a file, on a worker. See :meth:`.Store.receive`."""
+    Store(Path(dask_worker.local_directory) / "glintbsdf-files").receive(
+        content, offset, piece, last
+    )
+
+
+# ------------------------------------------------------------------------------------------------
+#  At the client
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Files for TLS, as Dask names them: certificates of the authority and of this client, and its
+    private key."""
+
+    ca_file: Path
+    cert: Path
+    key: Path
+
+
+class Cluster:
+    """A connection to a Dask scheduler and its workers; a context manager.
+
+    Use :meth:`local` or :meth:`at`.
+    """
+
+    def __init__(self, open_client: Callable[[ExitStack], object], tell: Callable[[str], None]):
+        self._open_client, self._tell = open_client, tell
+        self._stack = ExitStack()
+        self.client = None
+
+    @classmethod
+    def local(
+        cls,
+        workers: int,
+        memory_limit: str = "auto",
+        variant: str = "",
+        tell: Callable[[str], None] = warnings.warn,
+    ) -> Cluster:
+        """Processes on this machine that share its cores, reachable from this machine only.
+
+        Args:
+            workers: number of processes.
+            memory_limit: of each process, such as ``4GB``; a process beyond it is ended. ``auto``:
+                its part of the machine's memory.
+            variant: of Mitsuba; on GPUs each worker gets one.
+            tell: what happens meanwhile.
+        """
+
+        def open_client(stack: ExitStack) -> object:
+            import dask
+            from distributed import Client, Nanny, Scheduler, SpecCluster
+
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+            threads = max(1, (cores or os.cpu_count() or 1) // workers)
+            gpus = gpu_count() if variant.startswith("cuda") else 0
+            loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+            spec = {
+                number: {
+                    "cls": Nanny,
+                    "options": {
+                        "host": "127.0.0.1",
+                        "dashboard_address": "127.0.0.1:0",
+                        "nthreads": threads,
+                        "memory_limit": memory_limit,
+                        "silence_logs": "CRITICAL",
+                        "env": {"CUDA_VISIBLE_DEVICES": str(number % gpus)} if gpus else {},
+                    },
+                }
+                for number in range(workers)
+            }
+            stack.enter_context(dask.config.set(_LOCAL_SETTINGS))
+            cluster = stack.enter_context(
+                SpecCluster(
+                    workers=spec,
+                    scheduler={"cls": Scheduler, "options": loopback},
+                    silence_logs="CRITICAL",
+                )
+            )
+            return stack.enter_context(Client(cluster, timeout=60))
+
+        return cls(open_client, tell)
+
+    @classmethod
+    def at(
+        cls,
+        address: str,
+        keys: Keys | None = None,
+        tell: Callable[[str], None] = warnings.warn,
+    ) -> Cluster:
+        """The workers of a scheduler that runs already.
+
+        Args:
+            address: such as ``tcp://host:8786``, or ``tls://host:8786``; the scheme may be left
+                out.
+            keys: for TLS.
+            tell: what happens meanwhile.
+
+        Raises:
+            ClusterError: on entering: no scheduler answers, or its workers are of another version.
+        """
+        scheme, separator, rest = address.rpartition("://")
+        scheme = scheme if separator else ("tls" if keys else "tcp")
+        if scheme not in ("tcp", "tls"):
+            raise ClusterError(f'the address of a scheduler is tcp:// or tls:// (got "{address}")')
+        if (scheme == "tls") != (keys is not None):
+            raise ClusterError(
+                f"{scheme}://{rest} and TLS do not go together: "
+                + ("give its three files" if scheme == "tls" else "the address must be tls://")
+            )
+
+        def open_client(stack: ExitStack) -> object:
+            from distributed import Client
+            from distributed.security import Security
+
+            security = keys and Security(
+                tls_ca_file=str(keys.ca_file),
+                tls_client_cert=str(keys.cert),
+                tls_client_key=str(keys.key),
+                require_encryption=True,
+            )
+            if keys is None and not _is_loopback(rest):
+                tell(
+                    f"{rest} is reached without TLS: whoever is on the way can read the scene and "
+                    "run programs on the workers. See --tls-ca-file."
+                )
+            return stack.enter_context(
+                Client(f"{scheme}://{rest}", timeout=PATIENCE, security=security)
+            )
+
+        return cls(open_client, tell)
+
+    def __enter__(self) -> Cluster:
+        import asyncio
+        import logging
+
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        with ExitStack() as stack:
+            try:
+                self.client = self._open_client(stack)
+            except (OSError, TimeoutError, asyncio.TimeoutError, ValueError) as error:
+                raise ClusterError(f"no scheduler answers: {error}") from error
+            self._check_versions()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def _check_versions(self) -> None:
+        """Raise unless all workers that are there have this package, and in these versions."""
+        import importlib.metadata
+
+        # Without this package a worker could not even read a question that is part of it.
+        installed = self.client.run(importlib.metadata.version, "glintbsdf", on_error="return")
+        for address, answer in installed.items():
+            if isinstance(answer, Exception):
+                raise ClusterError(f"the worker {address} has no glintbsdf: install it there")
+        answers = self.client.run(version_difference, versions(), on_error="return")
+        for address, answer in answers.items():
+            if isinstance(answer, Exception):
+                raise ClusterError(f"the worker {address} cannot use its glintbsdf: {answer}")
+            if answer is not None:
+                raise ClusterError(f"the worker {address} has {answer}")
+
+    @property
+    def worker_count(self) -> int:
+        """Workers that are there now."""
+        return len(self.client.nthreads())
+
+    def render_all(self, job: Job) -> Callable[[Iterator[Unit]], Results]:
+        """What renders the units of a job, for :func:`~glintbsdf.scene.rendering.produce`.
+
+        Raises:
+            ClusterError: of its iterator: the scheduler is gone, a worker is of another version, or
+                none has the memory that a unit needs.
+        """
+        return lambda units: _Rendering(self, job).results(units)
+
+
+#: Settings of Dask for a local cluster: memory is for rendering, not for keeping results, and a
+#: worker whose kernels take long is not dead.
+_LOCAL_SETTINGS = {
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": 0.95,
+    "distributed.scheduler.allowed-failures": 1,
+    "distributed.scheduler.worker-ttl": None,
+    "distributed.admin.tick.limit": "1h",
+}
+
+
+@dataclass(frozen=True)
+class _Errand:
+    """A unit, or a part of one that was halved, that is under way."""
+
+    unit: Unit
+    place: tuple[int, ...]  # 0 or 1 for each time that it was halved
+
+
+class _Rendering:
+    """Units of a job under way on a cluster."""
+
+    def __init__(self, cluster: Cluster, job: Job) -> None:
+        self.cluster, self.client, self.job = cluster, cluster.client, job
+        self.flying: dict[object, _Errand] = {}
+        self.halves: dict[int, dict[tuple[int, ...], tuple[Tile, np.ndarray]]] = {}
+        self.sent: Counter[tuple[str, Content]] = Counter()
+        self.told: set[str] = set()
+
+    def results(self, units: Iterator[Unit]) -> Results:
+        units = iter(units)
+        begun, ended = time.monotonic(), False
+        try:
+            while True:
+                with _connected():
+                    workers = self.cluster.worker_count
+                while not ended and len(self.flying) < AHEAD * max(1, workers):
+                    unit = next(units, None)
+                    if unit is None:
+                        ended = True
+                    else:
+                        self.submit(_Errand(unit, ()))
+                if not self.flying:
+                    return
+                if not workers and time.monotonic() - begun > 10:
+                    self.tell_once("no worker has come yet; waiting")
+                done = self.landed()
+                if not done:
+                    yield None
+                for future in done:
+                    yield self.received(future)
+        finally:
+            with contextlib.suppress(Exception):
+                self.client.cancel(list(self.flying), force=True)
+
+    def landed(self) -> list[object]:
+        """Futures that have come to an end; none where a second passes without."""
+        from distributed import wait
+
+        with _connected():
+            try:
+                done = wait(list(self.flying), timeout=1, return_when="FIRST_COMPLETED").done
+            except TimeoutError:
+                return []
+        return sorted(done, key=lambda future: self.flying[future].unit.index)
+
+    def submit(self, errand: _Errand) -> None:
+        # The first units are the first to be merged.
+        with _connected():
+            future = self.client.submit(
+                work, self.job, errand.unit, versions(), pure=False, priority=-errand.unit.index
+            )
+        self.flying[future] = errand
+
+    def received(self, future: object) -> tuple[Unit, Tile, np.ndarray] | None:
+        """What has become of an errand: a unit that is done, or None if there is more to do."""
+        errand = self.flying.pop(future)
+        if future.status == "error":
+            self.failed(errand, future.exception())
+            return None
+        if future.status != "finished":
+            raise ClusterError(GONE)
+        with _connected():
+            answer = future.result()
+        if answer.missing:
+            self.send(answer)
+            self.submit(errand)
+            return None
+        if answer.trimmed_too_far:
+            self.tell_once("trimmed structures did not suffice: built in full")
+        if not errand.place:
+            return errand.unit, answer.tile, answer.sums
+        return self.joined(errand, answer)
+
+    def failed(self, errand: _Errand, error: Exception) -> None:
+        """Halve a unit that needs too much memory; raise for everything else."""
+        from distributed.scheduler import KilledWorker
+
+        if isinstance(error, ModuleNotFoundError):
+            raise ClusterError(f"a worker lacks a package: {error}") from error
+        if not isinstance(error, KilledWorker | MemoryError):
+            raise error
+        unit = errand.unit
+        halves = unit.halves() if len(errand.place) < HALVINGS else None
+        if halves is None:
+            raise ClusterError(
+                f"workers have died of unit {unit.index} even with {unit.spp} samples in each of "
+                f"{unit.tile.pixels} pixels, most likely as the scene needs more memory than they "
+                "have: give them more (--memory-limit), use fewer workers, or --trim"
+            ) from error
+        self.tell_once(
+            f"unit {unit.index} was too much for a worker's memory: halved, so that the noise of "
+            "the image is another, of the same size"
+        )
+        self.halves.setdefault(unit.index, {})
+        for number, half in enumerate(halves):
+            self.submit(_Errand(half, (*errand.place, number)))
+
+    def joined(self, errand: _Errand, answer: Answer) -> tuple[Unit, Tile, np.ndarray] | None:
+        """Add a half to its unit; the unit, if it is whole then.
+
+        Halves are added in their own order, whichever came first.
+        """
+        found = self.halves[errand.unit.index]
+        found[errand.place] = answer.tile, answer.sums
+        place = errand.place
+        while place:
+            both = [found.get((*place[:-1], number)) for number in range(2)]
+            if any(half is None for half in both):
+                return None
+            for number in range(2):
+                del found[(*place[:-1], number)]
+            place = place[:-1]
+            found[place] = _sum(both)
+        tile, sums = self.halves.pop(errand.unit.index)[()]
+        return errand.unit, tile, sums
+
+    def send(self, answer: Answer) -> None:
+        """Send a worker the files that it lacks.
+
+        Raises:
+            ClusterError: they do not arrive.
+            OSError, ValueError: a file is gone, or has been changed.
+        """
+        for content in answer.missing:
+            if content not in self.job.package.contents:
+                raise BadPackage(f"{answer.worker} asks for a file that the scene does not name")
+            self.sent[answer.worker, content] += 1
+            error = None
+            for offset, piece, last in pieces(content):
+                try:
+                    self.client.run(receive, content, offset, piece, last, workers=[answer.worker])
+                except Exception as failure:
+                    # A worker that has died meanwhile is not there to receive it, or to miss it.
+                    error = failure
+                    break
+            if error is not None and self.sent[answer.worker, content] > 3:
+                raise ClusterError(
+                    f"{content.path} does not arrive at the worker {answer.worker}: {error}"
+                ) from error
+
+    def tell_once(self, message: str) -> None:
+        if message not in self.told:
+            self.told.add(message)
+            self.cluster._tell(message)
+
+
+@contextlib.contextmanager
+def _connected() -> Iterator[None]:
+    """Raise ClusterError where the connection to the scheduler is lost in the block."""
+    from distributed import CancelledError
+    from distributed.comm import CommClosedError
+
+    try:
+        yield
+    except (OSError, CommClosedError, CancelledError) as error:
+        raise ClusterError(GONE) from error
+
+
+def _sum(parts: list[tuple[Tile, np.ndarray]]) -> tuple[Tile, np.ndarray]:
+    """Sums of two tiles, over the smallest rectangle that holds both."""
+    (first, a), (second, b) = parts
+    x, y = min(first.x, second.x), min(first.y, second.y)
+    right = max(tile.x + tile.width for tile in (first, second))
+    bottom = max(tile.y + tile.height for tile in (first, second))
+    both = Tile(x, y, right - x, bottom - y)
+    sums = np.zeros((both.height, both.width, a.shape[-1]), np.float32)
+    for tile, part in ((first, a), (second, b)):
+        sums[tile.slices(both)] += part
+    return both, sums
+
+
+def _is_loopback(address: str) -> bool:
+    host = address.rpartition(":")[0].strip("[]") or address
+    return host in ("localhost", "::1") or host.startswith("127.")
+
+
+def gpu_count() -> int:
+    """NVIDIA GPUs of this machine, as their driver counts them."""
+    import ctypes
+
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+    except OSError:
+        return 0
+    count = ctypes.c_int(0)
+    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)):
+        return 0
+    return count.value

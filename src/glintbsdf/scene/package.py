@@ -1,0 +1,335 @@
+"""A scene as it travels: its XML, the files that it names, and what they must be.
+
+A :class:`Package` says what a scene consists of, by digests of content. Whoever is to load it looks
+for the files where their names say, which serves on one machine and on a shared file system; what
+is not there, or is another, is sent, and is kept in a folder of the receiver under its digest. No
+name that a package holds can lead out of that folder.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+
+import drjit as dr
+import mitsuba as mi
+
+_DIGEST = re.compile(r"[0-9a-f]{40}")
+_SUFFIX = re.compile(r"(\.[A-Za-z0-9_]{1,16})?")
+
+#: Bytes of a file that are sent at a time.
+PIECE = 8 << 20
+
+
+class BadPackage(ValueError):
+    """A package, or a piece of a file, is not what a sender of good will sends."""
+
+
+# ------------------------------------------------------------------------------------------------
+#  Contents
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Content:
+    """A file by its content.
+
+    Attributes:
+        digest (str): of its bytes, 40 hexadecimal digits.
+        suffix (str): of its name, such as ``.exr``: some readers go by it.
+        path (str): where its owner has it.
+    """
+
+    digest: str
+    suffix: str
+    path: str
+
+    @staticmethod
+    def of(path: Path) -> Content:
+        suffix = path.suffix if _SUFFIX.fullmatch(path.suffix) else ""
+        return Content(digest_of(path), suffix, str(path.absolute()))
+
+    @property
+    def name(self) -> str:
+        """The name under which a receiver keeps it.
+
+        Raises:
+            BadPackage: it would lead elsewhere.
+        """
+        if not _DIGEST.fullmatch(self.digest) or not _SUFFIX.fullmatch(self.suffix):
+            raise BadPackage(
+                f"no content has the digest {self.digest!r} and suffix {self.suffix!r}"
+            )
+        return self.digest + self.suffix
+
+
+def digest_of(path: Path) -> str:
+    """Digest of the bytes of a file, 40 hexadecimal digits."""
+    digest = hashlib.blake2b(digest_size=20)
+    with path.open("rb") as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest_of_status(path: Path, _modified: int, _size: int) -> str:
+    """The digest of a file, read again where the file has changed."""
+    return digest_of(path)
+
+
+class Store:
+    """A folder of files under their digests.
+
+    Args:
+        folder: made when the first file arrives.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def find(self, content: Content) -> Path | None:
+        """A file of that content, the owner's or one that was received; None if there is none."""
+        received = self.folder / content.name
+        if received.is_file():
+            return received
+        own = Path(content.path)
+        try:
+            status = own.stat()
+            if not own.is_file() or content.digest != _digest_of_status(
+                own, status.st_mtime_ns, status.st_size
+            ):
+                return None
+        except OSError:
+            return None
+        return own
+
+    def receive(self, content: Content, offset: int, piece: bytes, last: bool) -> None:
+        """Take the next piece of a file; with the last one the file is there.
+
+        Raises:
+            BadPackage: pieces are out of order, or make another file than was promised.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        unfinished = self.folder / f"{content.name}.{os.getpid()}.part"
+        with unfinished.open("ab" if offset else "wb") as file:
+            complete = file.tell() == offset
+            file.write(piece)
+        if not complete:
+            unfinished.unlink()
+            raise BadPackage(f"a piece of {content.name} is missing")
+        if last:
+            if digest_of(unfinished) != content.digest:
+                unfinished.unlink()
+                raise BadPackage(f"what arrived as {content.name} is another file")
+            os.replace(unfinished, self.folder / content.name)
+
+
+def pieces(content: Content) -> Iterator[tuple[int, bytes, bool]]:
+    """What :meth:`Store.receive` takes, of the owner's file.
+
+    Raises:
+        OSError: the file is gone.
+        ValueError: the file has changed meanwhile.
+    """
+    path = Path(content.path)
+    if digest_of(path) != content.digest:
+        raise ValueError(f"{path} has been changed since the rendering began")
+    size, offset = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while True:
+            piece = file.read(PIECE)
+            yield offset, piece, offset + len(piece) >= size
+            offset += len(piece)
+            if offset >= size:
+                return
+
+
+# ------------------------------------------------------------------------------------------------
+#  Scenes
+# ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Package:
+    """What a scene consists of.
+
+    Attributes:
+        documents (tuple[tuple[str, Content], ...]): XML files, the scene's own first, by names
+            relative to a common folder.
+        files (tuple[tuple[str, Content], ...]): all other files, by the names in the XML.
+        definitions (tuple[tuple[str, str], ...]): values of the scene's parameters.
+    """
+
+    documents: tuple[tuple[str, Content], ...]
+    files: tuple[tuple[str, Content], ...]
+    definitions: tuple[tuple[str, str], ...]
+
+    @staticmethod
+    def of(filename: str | Path, definitions: Mapping[str, str] | None = None) -> Package:
+        """The package of a scene.
+
+        Raises:
+            RuntimeError: the XML cannot be read.
+        """
+        path = Path(filename).absolute()
+        definitions = dict(definitions or {})
+        _, state = _parsed(path, definitions)
+        documents = [Path(str(name)).resolve() for name in state.files]
+        root = Path(os.path.commonpath([document.parent for document in documents]))
+        files = {}
+        for _, _, value in _strings(state):
+            if value not in files and (found := _find(value, path.parent)) is not None:
+                files[value] = Content.of(found)
+        return Package(
+            tuple((d.relative_to(root).as_posix(), Content.of(d)) for d in documents),
+            tuple(files.items()),
+            tuple(definitions.items()),
+        )
+
+    @property
+    def contents(self) -> tuple[Content, ...]:
+        """All files of the scene."""
+        return tuple(content for _, content in (*self.documents, *self.files))
+
+    @property
+    def digest(self) -> str:
+        """Of all that decides the scene; where its owner has the files is left out."""
+        parts = [
+            [[name, content.digest] for name, content in group]
+            for group in (self.documents, self.files)
+        ]
+        text = json.dumps([*parts, self.definitions])
+        return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
+
+    def missing(self, store: Store) -> list[Content]:
+        """Files that must be sent."""
+        return [content for content in self.contents if store.find(content) is None]
+
+    def load(self, store: Store) -> mi.Scene:
+        """Load the scene, of which nothing is missing.
+
+        Raises:
+            BadPackage: a name leads out of the folder.
+        """
+        files = {name: str(store.find(content)) for name, content in self.files}
+        with tempfile.TemporaryDirectory(prefix="glintbsdf-") as folder:
+            for name, content in self.documents:
+                target = inside(Path(folder), name)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(store.find(content).read_bytes())
+            main = inside(Path(folder), self.documents[0][0])
+            config, state = _parsed(main, dict(self.definitions))
+            for node, key, value in _strings(state):
+                if value in files:
+                    node.props[key] = files[value]
+            mi.parser.transform_all(config, state)
+            return mi.parser.instantiate(config, state)
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The place of a relative name in a folder.
+
+    Raises:
+        BadPackage: it is not in there.
+    """
+    pure = PurePosixPath(name)
+    bad = pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or ":" in name
+    if bad or not (folder / pure).resolve().is_relative_to(folder.resolve()):
+        raise BadPackage(f"the name {name!r} leads out of the folder for files")
+    return folder / pure
+
+
+def _parsed(
+    path: Path, definitions: Mapping[str, str]
+) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
+    config = mi.parser.ParserConfig(mi.variant())
+    return config, mi.parser.parse_file(config, str(path), **definitions)
+
+
+def _strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str, str]]:
+    """All strings of a parsed scene: the node, the property's name, its value."""
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            value = node.props[key]
+            if isinstance(value, str):
+                yield node, key, value
+
+
+def _find(value: str, folder: Path) -> Path | None:
+    """The file that a string names, as Mitsuba finds it; None for other strings."""
+    if not value or len(value) > 4096 or "\0" in value:
+        return None
+    for path in (folder / value, Path(str(mi.file_resolver().resolve(value)))):
+        try:
+            if path.is_file():
+                return path
+        except OSError:
+            continue
+    return None
+
+
+# ------------------------------------------------------------------------------------------------
+#  Versions
+# ------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """What must be the same on all machines for their images to be: versions of packages, and of
+    this one the source."""
+    import glintbsdf
+    import glintbsdf.plugins
+
+    digest = hashlib.blake2b(digest_size=6)
+    for package in (glintbsdf, glintbsdf.plugins):
+        folder = Path(next(iter(package.__path__)))
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode())
+            digest.update(path.read_bytes())
+    return {
+        "glintbsdf": f"{glintbsdf.__version__} (source {digest.hexdigest()})",
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+    }
+
+
+def version_difference(others: Mapping[str, str]) -> str | None:
+    """In words, what the versions here and elsewhere differ in; None where they do not."""
+    for name, own in versions().items():
+        if others.get(name) != own:
+            return f"{name} {own}, and not {others.get(name)}"
+    return None
+
+
+@dataclass(frozen=True)
+class Job:
+    """An image to be made: all that decides it.
+
+    Attributes:
+        package (Package): the scene.
+        variant (str): of Mitsuba.
+        spp (int): samples per pixel.
+        seed (int): of the image.
+        denoise, trim (bool): see :class:`~glintbsdf.scene.rendering.Renderer` and
+            :class:`~glintbsdf.scene.inspection.Trimmed`.
+    """
+
+    package: Package
+    variant: str
+    spp: int
+    seed: int
+    denoise: bool = False
+    trim: bool = False
+
+    def description(self) -> dict[str, object]:
+        """For checkpoints: what decides the image, in words and numbers."""
+        own = {k: v for k, v in asdict(self).items() if k not in ("package", "trim")}
+        return {"scene": self.package.digest, **own, **versions()}

@@ -1,0 +1,396 @@
+"""Rendering by many processes: the same image, to the last bit, whatever happens to them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from glintbsdf.scene import cluster as clusters
+from glintbsdf.scene import package, rendering, units
+from glintbsdf.scene.cluster import Cluster, ClusterError, Keys
+from glintbsdf.scene.package import Job, Package
+from glintbsdf.scene.passes import Tile
+from glintbsdf.scene.storage import Checkpoint
+
+pytest.importorskip("distributed")
+# Dask leaves sockets and loops to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+SCENE = """<scene version="3.0.0">
+    <default name="size" value="16"/>
+    <default name="integrator" value="path"/>
+    <integrator type="$integrator"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective">
+        <float name="fov" value="30"/>
+        <transform name="to_world"><lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="$size"/>
+            <integer name="height" value="$size"/>
+        </film>
+        <sampler type="independent"><integer name="sample_count" value="48"/></sampler>
+    </sensor>
+    <emitter type="constant"/>
+    <shape type="sphere"><point name="center" x="1" y="1" z="0"/><float name="radius" value="0.4"/>
+        <bsdf type="diffuse"/></shape>
+    <shape type="rectangle">
+        <bsdf type="glint_manifold"><string name="filename" value="map.exr"/></bsdf>
+    </shape>
+</scene>
+"""
+SPP = 48  # in units of 2 samples per pixel
+UNITS = 24
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> Path:
+    """A folder, made the current one, with a small scene in it and its map."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(units, "FEWEST", 512)
+    (tmp_path / "scene.xml").write_text(SCENE)
+    heights = np.random.default_rng(1).random((16, 16, 1), dtype=np.float32)
+    mi.Bitmap(heights).write("map.exr")
+    return tmp_path
+
+
+@pytest.fixture
+def job(folder: Path, variant: str) -> Job:
+    return Job(Package.of("scene.xml"), variant, SPP, 7)
+
+
+@pytest.fixture(scope="module")
+def two() -> Cluster:
+    """Two processes, for all tests that leave them alive."""
+    with Cluster.local(2, tell=print) as cluster:
+        yield cluster
+
+
+def image(job: Job, cluster: Cluster | None, render_all=None, **options) -> np.ndarray:
+    scene = rendering.load_scene("scene.xml", dict(job.package.definitions))
+    with rendering.Renderer(scene, job.spp, job.denoise) as renderer:
+        assert len(renderer.plan(job.seed)) == UNITS
+        render_all = render_all or (cluster and cluster.render_all(job))
+        return np.array(rendering.produce(renderer, job.seed, render_all, **options).bitmap)
+
+
+def pids(cluster: Cluster) -> list[int]:
+    return list(cluster.client.run(os.getpid).values())
+
+
+# ---------------------------------------------------------------------------------------------
+#  The same image
+# ---------------------------------------------------------------------------------------------
+
+
+def test_two_processes(job, two):
+    assert np.array_equal(image(job, two), image(job, None))
+
+
+@pytest.mark.parametrize("changes", [{"trim": True}, {"denoise": True}], ids=["trim", "denoise"])
+def test_options(job, two, changes, folder):
+    if "denoise" in changes:
+        pytest.importorskip("mitsuba_oidn")
+    package = Package.of("scene.xml", {"integrator": "glint_path"})
+    job = replace(job, package=package, **changes)
+    assert np.array_equal(image(job, two), image(job, None))
+
+
+@pytest.mark.parametrize("colours", ["spectral", "spectral_polarized"])
+def test_other_variants(job, two, variant, colours):
+    """A worker changes its variant as well."""
+    backend = variant.split("_")[0]
+    mi.set_variant(f"{backend}_ad_{colours}")
+    job = replace(job, variant=mi.variant())
+    assert np.array_equal(image(job, two), image(job, None))
+
+
+def test_a_killed_worker(job):
+    """SIGKILL in the middle: its units go to the others, and it is replaced."""
+    with Cluster.local(3) as cluster:
+        before = set(pids(cluster))
+        merged = []
+
+        def kill(done) -> None:
+            merged.append(done.count)
+            if len(merged) in (2, 5):
+                os.kill(pids(cluster)[0], signal.SIGKILL)
+
+        killed = image(job, cluster, observe=kill)
+        assert before - set(pids(cluster))
+    assert np.array_equal(killed, image(job, None))
+
+
+def test_workers_of_unequal_speed(job):
+    with Cluster.local(3) as cluster:
+        slow = pids(cluster)[0]
+        os.kill(slow, signal.SIGSTOP)
+        try:
+            render_all = cluster.render_all(job)
+
+            def watched(wanted):
+                for number, result in enumerate(render_all(wanted)):
+                    if number == 8:
+                        os.kill(slow, signal.SIGCONT)
+                    yield result
+
+            unequal = image(job, cluster, watched)
+        finally:
+            os.kill(slow, signal.SIGCONT)
+    assert np.array_equal(unequal, image(job, None))
+
+
+def test_files_are_sent_where_they_are_not(job, two):
+    """As to another machine: no path of the sender exists there."""
+
+    def away(group):
+        return tuple((name, replace(content, path="/nowhere")) for name, content in group)
+
+    sent = []
+    original = package.pieces
+    there = {content.digest: content for content in job.package.contents}
+    travelling = replace(job.package, documents=away(job.package.documents),
+                         files=away(job.package.files))  # fmt: skip
+
+    def of_the_sender(content):
+        sent.append(content.digest)
+        return original(there[content.digest])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clusters, "pieces", of_the_sender)
+        remote = image(replace(job, package=travelling), two)
+    assert set(sent) == set(there)
+    assert np.array_equal(remote, image(job, None))
+
+
+# ---------------------------------------------------------------------------------------------
+#  Ends, and going on
+# ---------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_serves_any_number_of_processes(job, two, tmp_path):
+    class Enough(Exception):
+        pass
+
+    def end(done) -> None:
+        if done.count >= 9:
+            raise Enough
+
+    with pytest.raises(Enough):
+        image(job, two, checkpoint=Checkpoint(tmp_path / "kept", job.description()), observe=end)
+    rendered = []
+    original = rendering.Renderer.render
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            rendering.Renderer,
+            "render",
+            lambda self, unit: (rendered.append(unit.index), original(self, unit))[1],
+        )
+        resumed = image(job, None, checkpoint=Checkpoint(tmp_path / "kept", job.description()))
+    assert 0 < len(rendered) <= UNITS - 9
+    assert np.array_equal(resumed, image(job, None))
+
+
+def test_until_noise(job, two):
+    noisy = image(job, two, until_noise=1e-9)
+    assert np.array_equal(noisy, image(job, None))
+    limit = 0.05
+    assert np.array_equal(image(job, two, until_noise=limit), image(job, None, until_noise=limit))
+
+
+# ---------------------------------------------------------------------------------------------
+#  Memory
+# ---------------------------------------------------------------------------------------------
+
+
+class Forgetful:
+    """A client whose workers cannot hold units of more than some samples."""
+
+    def __init__(self, client, most: int, error: type[Exception]) -> None:
+        self.client, self.most, self.error = client, most, error
+
+    def submit(self, function, job, unit, *arguments, **options):
+        if unit.spp * unit.tile.pixels > self.most:
+            return self.client.submit(_fail, self.error, unit.index, pure=False)
+        return self.client.submit(function, job, unit, *arguments, **options)
+
+    def __getattr__(self, name: str):
+        return getattr(self.client, name)
+
+
+def _fail(error: type[Exception], index: int) -> None:
+    raise error(f"of unit {index}")
+
+
+def test_a_unit_that_is_too_large_is_halved(job, two, capsys):
+    """Down to an eighth of its samples: another image of the same light."""
+    forgetful = Cluster(None, print)
+    forgetful.client = Forgetful(two.client, 128, MemoryError)
+    halved = image(job, forgetful)
+    assert "halved, so that the noise of the image is another" in capsys.readouterr().out
+    assert np.array_equal(halved, image(job, forgetful))
+    expected = image(job, None)
+    assert not np.array_equal(halved, expected)
+    assert halved.mean() == pytest.approx(expected.mean(), rel=0.05)
+
+
+def test_a_scene_that_is_too_large_is_told(job, two):
+    forgetful = Cluster(None, print)
+    forgetful.client = Forgetful(two.client, 0, MemoryError)
+    with pytest.raises(ClusterError, match="needs more memory than they have"):
+        image(job, forgetful)
+
+
+def test_sums_of_halves():
+    """Tiles of halves may overlap by the filter's reach, or be the same."""
+    first, second = Tile(2, 3, 4, 2), Tile(2, 4, 4, 3)
+    both, sums = clusters._sum(
+        [(first, np.full((2, 4, 1), 1.0)), (second, np.full((3, 4, 1), 2.0))]
+    )
+    assert both == Tile(2, 3, 4, 4)
+    assert sums[:, 0, 0].tolist() == [1, 3, 2, 2]
+
+
+# ---------------------------------------------------------------------------------------------
+#  What is refused
+# ---------------------------------------------------------------------------------------------
+
+
+def test_another_version(job, two, monkeypatch):
+    older = {**package.versions(), "glintbsdf": "0.0.1"}
+    monkeypatch.setattr(clusters, "versions", lambda: older)
+    with pytest.raises(ClusterError, match=r"the worker tcp://\S+ has glintbsdf 0\.1.*not 0\.0\.1"):
+        two._check_versions()
+    with pytest.raises(ClusterError, match=r"has glintbsdf 0\.1"):
+        image(job, two)
+
+
+def test_an_error_of_the_scene_is_passed_on(job, two):
+    bad = replace(job, package=replace(job.package, definitions=(("nothing", "1"),)))
+    with pytest.raises(RuntimeError, match="nothing=1"):
+        image(job, None, two.render_all(bad))
+
+
+def closed_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "no-such-host.invalid"])
+def test_no_such_scheduler(host):
+    begun = time.monotonic()
+    with pytest.raises(ClusterError, match="no scheduler answers"):
+        Cluster.at(f"{host}:{closed_port()}", tell=print).__enter__()
+    assert time.monotonic() - begun < 10
+
+
+def test_addresses():
+    keys = Keys(Path("ca"), Path("cert"), Path("key"))
+    for address, given in (("http://a:1", None), ("tls://a:1", None), ("tcp://a:1", keys)):
+        with pytest.raises(ClusterError):
+            Cluster.at(address, given)
+
+
+@pytest.mark.parametrize("address, warned", [("127.0.0.1", False), ("192.0.2.1", True)])
+def test_a_warning_without_tls(address, warned, monkeypatch):
+    monkeypatch.setattr(clusters, "PATIENCE", 0.2)
+    told = []
+    with pytest.raises(ClusterError):
+        Cluster.at(f"{address}:{closed_port()}", tell=told.append).__enter__()
+    assert bool(told) == warned and all("without TLS" in message for message in told)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_a_local_cluster_listens_on_loopback_only(two):
+    """Scheduler, nannies, workers, and their dashboards."""
+    owners = {os.getpid(), *pids(two), *two.client.run(os.getppid).values()}
+    children = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(os.getpid())], capture_output=True, text=True
+    )
+    owners |= {int(pid) for pid in children.stdout.split()}
+    inodes = set()
+    for pid in owners:
+        for link in Path(f"/proc/{pid}/fd").glob("*"):
+            try:
+                inodes.add(os.readlink(link))
+            except OSError:
+                continue
+    listening = []
+    for table, loopback in (("tcp", "0100007F"), ("tcp6", "0" * 24 + "01000000")):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and f"socket:[{fields[9]}]" in inodes:
+                listening.append(fields[1].partition(":")[0] == loopback)
+    assert len(listening) >= 4 and all(listening)
+
+
+# ---------------------------------------------------------------------------------------------
+#  A scheduler of its own
+# ---------------------------------------------------------------------------------------------
+
+
+class Scheduler:
+    """``dask scheduler`` and a ``dask worker``, as a user starts them."""
+
+    def __init__(self, folder: Path, *options: str, scheme: str = "tcp") -> None:
+        self.address = f"{scheme}://127.0.0.1:{closed_port()}"
+        port = self.address.rpartition(":")[2]
+        common = ["--host", "127.0.0.1", *options]
+        self.processes = [
+            self.start(folder, "scheduler", "--port", port, "--no-dashboard", *common),
+            self.start(folder, "worker", self.address, "--no-dashboard", *common),
+        ]
+
+    @staticmethod
+    def start(folder: Path, *arguments: str) -> subprocess.Popen:
+        return subprocess.Popen(
+            [sys.executable, "-m", "dask", *arguments],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def kill(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+def test_a_killed_scheduler(job, folder, tmp_path):
+    """An error, and the same command goes on from its checkpoint with another scheduler."""
+
+    def kept() -> Checkpoint:
+        return Checkpoint(tmp_path / "kept", job.description())
+
+    scheduler = Scheduler(tmp_path)
+    try:
+        with Cluster.at(scheduler.address, tell=print) as cluster:
+
+            def kill(done) -> None:
+                if done.count >= 5:
+                    scheduler.kill()
+
+            with pytest.raises(ClusterError, match="the scheduler is gone"):
+                image(job, cluster, observe=kill, checkpoint=kept())
+    finally:
+        scheduler.kill()
+    scheduler = Scheduler(tmp_path)
+    try:
+        with Cluster.at(scheduler.address, tell=print) as cluster:
+            counts = []
+            resumed = image(
+                job, cluster, observe=lambda done: counts.append(done.count), checkpoint=kept()
+            )
+    finally:
+        scheduler.kill()
+    assert counts[0] >= 5
+    assert np.array_equal(resumed, image(job, None))
