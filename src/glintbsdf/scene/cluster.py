@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import threading
 import time
 import warnings
@@ -166,6 +167,12 @@ def _spare_thread(threads: int) -> Iterator[None]:
         dr.set_thread_count(threads)
 
 
+def dask_setup(worker: object) -> None:
+    """Called by Dask in each process of a local cluster: a terminal sends Ctrl-C to all processes,
+    and the one that knows what is done decides."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def receive(content: Content, offset: int, piece: bytes, last: bool, dask_worker=None) -> None:
     """Take a piece of a file, on a worker. See :meth:`.Store.receive`."""
     Store(Path(dask_worker.local_directory) / "glintbsdf-files").receive(
@@ -233,6 +240,7 @@ class Cluster:
                         "dashboard_address": "127.0.0.1:0",
                         "nthreads": threads,
                         "memory_limit": memory_limit,
+                        "preload": [__name__],
                         "silence_logs": "CRITICAL",
                         "env": {"CUDA_VISIBLE_DEVICES": str(number % gpus)} if gpus else {},
                     },
