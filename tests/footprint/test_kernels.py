@@ -153,3 +153,48 @@ def test_extreme_footprints_are_finite(variant, kernel, wrap_mode):
 def test_unknown_kernel_is_refused(variant):
     with pytest.raises(ParameterError, match='"kernel" must be one of gaussian, disk, box'):
         texel_kernel("tent", FOOTPRINTS["round"])
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_derivatives_of_averages(variant, kernel):
+    """Those of the integral, 0, and of the variances, for a footprint that grows by a factor, and
+    the mean's, 1, for one that moves, although the edges that move are in no value."""
+    n, extent = 900, 9.0  # jittered points of a square around the footprint
+    rng = np.random.default_rng(0)
+    x, y = (
+        ((k + rng.random((n, n))) * (2 * extent / n) - extent).astype(np.float32).ravel()
+        for k in np.meshgrid(np.arange(n), np.arange(n))
+    )
+    offset, area = mi.Vector2f(mi.Float(x), mi.Float(y)), (2 * extent / n) ** 2
+    scale = dr.opaque(mi.Float, 1.0)
+    dr.enable_grad(scale)
+    axes = ((1.5, 0.5), (-0.3, 1.0))
+    du, dv = (mi.Vector2f(u * scale / WIDTH, v * scale / HEIGHT) for u, v in axes)
+    k = TexelKernel(kernel, Footprint(mi.Point2f(0.4, 0.6), du, dv), HEIGHT, WIDTH, "repeat")
+    value = k.value(offset)
+    derivatives = []
+    for moment in (1, x * x, y * y):
+        dr.backward(dr.sum(value * mi.Float(moment)) * area, dr.ADFlag.ClearVertices)
+        derivatives.append(dr.grad(scale)[0])
+        dr.set_grad(scale, 0)
+    share = {"gaussian": 1 - 4.5 * np.exp(-4.5) / (1 - np.exp(-4.5)), "disk": 2.25 / 4,
+             "box": 2.25 / 3}[kernel]  # fmt: skip
+    variances = 2 * share * np.diag(covariance(axes))
+    assert abs(derivatives[0]) < 0.01
+    assert np.allclose(derivatives[1:], variances, rtol=0.02)
+
+    place = dr.opaque(mi.Float, 0.0)
+    dr.enable_grad(place)
+    footprint = Footprint(mi.Point2f(0.4 + place / WIDTH, 0.6), dr.detach(du), dr.detach(dv))
+    k = TexelKernel(kernel, footprint, HEIGHT, WIDTH, "repeat")
+    value = k.value(offset - mi.Vector2f(place, 0))
+    dr.backward(dr.sum(value * mi.Float(x)) * area)
+    assert np.isclose(dr.grad(place)[0], 1, rtol=0.01)
+
+
+def test_derivatives_of_a_round_kernel_are_finite(variant):
+    sigma = dr.opaque(mi.Float, 0.02)
+    dr.enable_grad(sigma)
+    k = TexelKernel("gaussian", Footprint.isotropic(mi.Point2f(0.5), sigma), 64, 64, "repeat")
+    dr.backward(k.minor_variance)
+    assert dr.allclose(dr.grad(sigma), 2 * 0.02 * 64**2, rtol=1e-3)

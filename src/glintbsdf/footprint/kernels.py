@@ -9,12 +9,18 @@ of unit integral:
 * ``box``: uniform over |Δu| ≤ 1.5 σ_u, |Δv| ≤ 1.5 σ_v, with σ_u, σ_v the standard deviations along
   the axes.
 
+All three end at an edge, which moves with the footprint. What a footprint loses and gains there is
+part of the derivative of every average under it, though no value shows it: without, the integral of
+a Gaussian kernel would seem to fall by a tenth as its standard deviation grows by one. Derivatives
+are therefore those of an edge of some width (:data:`EDGE`), centred on the true one, so that those
+of the kernel's integral and of its mean are exact; values are those of the sharp edge.
+
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
 
 from __future__ import annotations
 
-from math import pi
+from math import exp, pi, sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +32,10 @@ KERNELS = ("gaussian", "disk", "box")
 
 #: Reach of each kernel in standard deviations.
 REACH = {"gaussian": 3.0, "disk": 1.5, "box": 1.5}
+
+#: Width of the edge that derivatives see: in ρ², for the box as a share of its half extents. The
+#: derivative of the kernel's variance is off by the square of it, 1 % for the disk.
+EDGE = {"gaussian": 1.0, "disk": 0.5, "box": 0.1}
 
 #: Standard deviation (texels) of the isotropic Gaussian added to every footprint, so that one of no
 #: extent still has a density, the "finest answer". A footprint of half a texel widens by 0.01 %.
@@ -78,6 +88,16 @@ def limit_extent(du, dv):
     )
 
 
+def ramp(x):
+    """Rises from 0 to 1 as ``x`` goes from −½ to ½."""
+    return dr.clip(x + 0.5, 0, 1)
+
+
+def without_value(x):
+    """Zero, with the derivative of ``x``."""
+    return x - dr.detach(x)
+
+
 class TexelKernel:
     """The kernel of one footprint per lane, over a map of ``width`` × ``height`` texels.
 
@@ -96,7 +116,8 @@ class TexelKernel:
         du, dv (mi.Vector2f): the footprint's axes in texels, limited, before ``added``.
         minor_variance (mi.Float): smaller eigenvalue of Σ, texels².
         mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
-        reach_u, reach_v (mi.Float): half extents in texels of the kernel's support.
+        half_u, half_v (mi.Float): half extents in texels of the kernel's support.
+        reach_u, reach_v (mi.Float): of what counts: a little more where derivatives are taken.
     """
 
     def __init__(
@@ -131,7 +152,7 @@ class TexelKernel:
 
         # The smaller eigenvalue from the larger one, as their difference cancels.
         half = 0.5 * (variance_u - variance_v)
-        radius = dr.sqrt(dr.fma(half, half, covariance * covariance))
+        radius = dr.sqrt(dr.fma(half, half, covariance * covariance + TINY))
         self.minor_variance = determinant / (0.5 * (variance_u + variance_v) + radius)
 
         self.sigma_u, self.sigma_v = dr.sqrt(variance_u), dr.sqrt(variance_v)
@@ -139,20 +160,29 @@ class TexelKernel:
         self.sigma_u_given_v = dr.sqrt(determinant / variance_v)
         self.inverse_u_given_v = dr.rcp(self.sigma_u_given_v)
         self.inverse_v = dr.rcp(self.sigma_v)
-        self.cut_at(REACH[kernel])
+        self.cut_at(REACH[kernel], EDGE[kernel])
 
-    def cut_at(self, reach: float | mi.Float) -> None:
-        """Cut the kernel at this Mahalanobis distance (the box: so many standard deviations)."""
-        self.reach = reach
-        self.reach_u, self.reach_v = reach * self.sigma_u, reach * self.sigma_v
+    def cut_at(self, reach: float | mi.Float, edge: float = 0.0) -> None:
+        """Cut the kernel at this Mahalanobis distance (the box: so many standard deviations).
+
+        ``edge``: the width that the cut has for derivatives, see :data:`EDGE`.
+        """
+        self.edge = edge if dr.grad_enabled((self.mean, self.du, self.dv)) else 0.0
+        self.reach = self.cut = reach
+        self.half_u, self.half_v = reach * self.sigma_u, reach * self.sigma_v
+        if self.edge:
+            self.reach = (
+                reach * (1 + 0.5 * edge) if self.kernel == "box" else sqrt(reach**2 + 0.5 * edge)
+            )
+        self.reach_u, self.reach_v = self.reach * self.sigma_u, self.reach * self.sigma_v
         if self.kernel == "box":
-            self.peak = dr.rcp(4 * self.reach_u * self.reach_v)
+            self.peak = dr.rcp(4 * self.half_u * self.half_v)
             return
         gaussian = self.kernel == "gaussian"
         mass = 2 * pi * (1 - dr.exp(-0.5 * reach**2)) if gaussian else pi * reach**2
         self.peak = self.inverse_u_given_v * self.inverse_v / mass
         # Row at which the ellipse reaches furthest to the right.
-        self.row_of_reach_u = reach * self.shear * dr.square(self.sigma_v) / self.sigma_u
+        self.row_of_reach_u = self.reach * self.shear * dr.square(self.sigma_v) / self.sigma_u
 
     def whitened(self, offset):
         """The linear map of an offset (texels) to a vector of length ρ (not for the box)."""
@@ -161,23 +191,36 @@ class TexelKernel:
             offset.y * self.inverse_v,
         )
 
-    def value(self, offset):
-        """k(Δ) in 1/texel², for ``offset`` Δ = u − x in texels."""
+    def value(self, offset, edge: bool = True):
+        """k(Δ) in 1/texel², for ``offset`` Δ = u − x in texels.
+
+        ``edge``: whether the derivative tells of the edge that moves across ``offset``.
+        """
         if self.kernel == "box":
-            inside = (dr.abs(offset.x) <= self.reach_u) & (dr.abs(offset.y) <= self.reach_v)
-            return dr.select(inside, self.peak, 0)
+            u, v = dr.abs(offset.x), dr.abs(offset.y)
+            value = dr.select((u <= self.half_u) & (v <= self.half_v), self.peak, 0)
+            if not edge or not self.edge:
+                return value
+            inside_u, inside_v = (
+                ramp((1 - x / half) * (1 / self.edge))
+                for x, half in ((u, self.half_u), (v, self.half_v))
+            )
+            return value + self.peak * without_value(inside_u * inside_v)
         rho2 = dr.squared_norm(self.whitened(offset))
-        inside = rho2 <= self.reach**2
-        if self.kernel == "disk":
-            return dr.select(inside, self.peak, 0)
-        return dr.select(inside, self.peak * dr.exp(-0.5 * rho2), 0)
+        gaussian = self.kernel == "gaussian"
+        value = self.peak * dr.exp(-0.5 * rho2) if gaussian else self.peak
+        value = dr.select(rho2 <= self.cut**2, value, 0)
+        if not edge or not self.edge:
+            return value
+        height = self.peak * exp(-0.5 * self.cut**2) if gaussian else self.peak
+        return value + height * without_value(ramp((self.cut**2 - rho2) * (1 / self.edge)))
 
     def sample(self, sample):
         """Draw an offset Δ (texels) with density k from ``sample`` in [0, 1)²."""
-        reach = self.reach
+        reach = self.cut
         if self.kernel == "box":
             return mi.Vector2f(
-                self.reach_u * dr.fma(2, sample.x, -1), self.reach_v * dr.fma(2, sample.y, -1)
+                self.half_u * dr.fma(2, sample.x, -1), self.half_v * dr.fma(2, sample.y, -1)
             )
         if self.kernel == "disk":
             rho = reach * dr.sqrt(sample.x)
@@ -189,7 +232,7 @@ class TexelKernel:
 
     def touched_quads(self):
         """Number of quads that the support's bounding box touches, on average over its place."""
-        return dr.fma(2, self.reach_u, 1) * dr.fma(2, self.reach_v, 1)
+        return dr.fma(2, self.half_u, 1) * dr.fma(2, self.half_v, 1)
 
     def row_at(self, v):
         """Extent (left, right) of the support at the height ``v``, all in texels from the mean."""

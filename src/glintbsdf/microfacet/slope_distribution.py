@@ -26,6 +26,7 @@ from math import pi, sqrt
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.kernels import difference_of_products
 
 DISTRIBUTIONS = ("beckmann", "ggx")
@@ -234,11 +235,11 @@ def sample_above(x, survival, active):
     start = dr.fma(-x, mills_ratio(x), 1)
     log_survival = dr.log(survival)
     with dr.suspend_grad():
-        q, _, _ = dr.while_loop(
+        q, _, _ = symbolic_loop(
             (mi.Float(0), mi.UInt32(0), mi.Bool(active)),
             lambda q, count, active: active,
             advance,
-            label="visible slopes",
+            "visible slopes",
         )
     # One more step, which carries derivatives: at the solution, those of the inverse function.
     return x + dr.sqrt(dr.maximum(step(dr.maximum(q, 1e-12)), 1e-12))

@@ -22,6 +22,7 @@ import numpy as np
 
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
@@ -272,11 +273,11 @@ class Mixture(PNDF):
             return count, x, y, offset, active & ~accepted & (count < MAX_ATTEMPTS)
 
         with dr.suspend_grad():
-            count, x, y, offset, _ = dr.while_loop(
+            count, x, y, offset, _ = symbolic_loop(
                 (mi.UInt32(0), mi.Int(0), mi.Int(0), mi.Vector2f(0), mi.Bool(active)),
                 lambda *state: state[-1],
                 attempt,
-                label="element",
+                "element",
             )
         normal, jacobian = self.element(x, y, active)
         mean, distribution = normal, Gaussian(variance=dr.square(self.sigma_r))

@@ -34,6 +34,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
@@ -520,21 +521,14 @@ class MomentPyramid:
         step = major * step
         origin = self.nearest_means(kernel.mean, grids[0])
 
-        # What derivatives flow through is part of the loop's state: they do not find it otherwise.
-        def body(k, mean, step, variance, sharpness, weights, *totals):
+        def body(k, weights, *totals):
             weight = dr.exp(-sharpness * k * k)
-            values = self.lookup(mean + k * step, variance, grids, origin)
+            values = self.lookup(kernel.mean + k * step, variance, grids, origin)
             totals = [dr.fma(weight, x, total) for x, total in zip(values, totals, strict=True)]
-            return k + 1, mean, step, variance, sharpness, weights + weight, *totals
+            return k + 1, weights + weight, *totals
 
-        zeros = [mi.Float(0) for _ in range(self.channels)]
-        weights, *totals = dr.while_loop(
-            (-steps, kernel.mean, step, variance, sharpness, mi.Float(0), *zeros),
-            lambda k, *_: k <= steps,
-            body,
-            max_iterations=-1,
-            label="taps",
-        )[5:]
+        state = (-steps, mi.Float(0), *[mi.Float(0) for _ in range(self.channels)])
+        _, weights, *totals = symbolic_loop(state, lambda k, *_: k <= steps, body, "taps")
         weights = dr.select(active, weights, 1)
         return central(origin, [total / weights for total in totals], self.spread)
 

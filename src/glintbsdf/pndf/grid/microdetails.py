@@ -20,6 +20,7 @@ import mitsuba as mi
 
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import coherent_vertex, gaussian, pcg3d, uniform
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.gaussian import is_literal_zero
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
@@ -177,10 +178,8 @@ class CoveredCells:
             return step + 1, total
 
         end = finer_columns + coarser_columns
-        _, total = dr.while_loop(
-            (mi.Int(0), zero), lambda step, total: active & (step < end), column, label="cells"
-        )
-        return total
+        more = lambda step, total: active & (step < end)  # noqa: E731
+        return symbolic_loop((mi.Int(0), zero), more, column, "cells")[1]
 
 
 def covariance(du: mi.Vector2f, dv: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -273,11 +272,11 @@ class ReflectingCount:
             return count + 1, probability, below + probability
 
         none = dr.exp(n * self.log_none)
-        count, probability, below = dr.while_loop(
+        count, probability, below = symbolic_loop(
             (mi.Float(0), none, none + 0),
             lambda count, probability, below: active & (u >= below) & (count < EXACT_TERMS),
             more,
-            label="binomial",
+            "binomial",
         )
         ratio = dr.maximum(n - EXACT_TERMS, 0) * (self.odds / (EXACT_TERMS + 1))
 

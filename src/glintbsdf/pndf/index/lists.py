@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
@@ -71,9 +72,7 @@ def every_quad(lattice: Lattice, kernel, add, active, zero=None):
         mi.Bool(active),
         mi.Float(0) if zero is None else zero,
     )
-    return dr.while_loop(
-        state, lambda *state: state[4], body, max_iterations=-1, label="every quad"
-    )[5]
+    return symbolic_loop(state, lambda *state: state[4], body, "every quad")[5]
 
 
 def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=None) -> mi.Float:
@@ -127,12 +126,8 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
             corner = mi.Vector2f(origin_x + place[1], origin_y + place[0]) - mean
             return entry + 1, add(density, *place, corner, found)
 
-        _, density = dr.while_loop(
-            (entry, density),
-            lambda entry, _: active & (entry < end),
-            add_entry,
-            max_iterations=-1,
-            label="entries",
+        _, density = symbolic_loop(
+            (entry, density), lambda entry, _: active & (entry < end), add_entry, "entries"
         )
         return x, right, next_y, origin_y, row, active, density
 
@@ -140,9 +135,7 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
     none = mi.Int(0)
     zero = mi.Float(0) if zero is None else zero
     state = (none + 0, none - 1, top, none + 0, none + 0, mi.Bool(active), zero)
-    return dr.while_loop(
-        state, lambda *state: state[-2], body, max_iterations=-1, label="quad lists"
-    )[-1]
+    return symbolic_loop(state, lambda *state: state[-2], body, "quad lists")[-1]
 
 
 class Packed:

@@ -550,7 +550,7 @@ class ClusteredManifold(Manifold):
     def rung(self, kernel):
         """The rung of the ladder for a kernel: the highest that its r_x r_y τ allows."""
         if self.kernel == "box":
-            radii = kernel.reach_u * kernel.reach_v
+            radii = kernel.half_u * kernel.half_v
         else:  # the principal ones, of a rotated footprint
             radii = REACH[self.kernel] ** 2 * kernel.sigma_u_given_v * kernel.sigma_v
         few = kernel.touched_quads() <= FEW_QUADS

@@ -42,6 +42,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.hashing import pcg3d
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel, difference_of_products
@@ -463,7 +464,7 @@ def triangle_weight(kernel: TexelKernel, corner, centroid: float):
     def overlap(low, reach):
         return dr.maximum(dr.minimum(low + 1, reach) - dr.maximum(low, -reach), 0)
 
-    return overlap(corner.x, kernel.reach_u) * overlap(corner.y, kernel.reach_v)
+    return overlap(corner.x, kernel.half_u) * overlap(corner.y, kernel.half_v)
 
 
 def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
@@ -502,9 +503,7 @@ def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
     top = square(mean.y - kernel.reach_v)
     first, last = extent(top)
     state = (first, top + 0, last, mi.Bool(active), *sums)
-    return dr.while_loop(
-        state, lambda *state: state[3], body, max_iterations=-1, label="every stratum"
-    )[4:]
+    return symbolic_loop(state, lambda *state: state[3], body, "every stratum")[4:]
 
 
 # ------------------------------------------------------------------------------------------------
@@ -563,13 +562,8 @@ def mean_over_points(mesh: TexelMesh, kernel: TexelKernel, directions: list, act
             new.append(total + dr.select(active, ggx_area(mean, spread), 0))
         return k + 1, *new
 
-    totals = dr.while_loop(
-        (mi.UInt32(0), *[mi.Float(0) for _ in directions]),
-        lambda k, *_: active & (k < count),
-        body,
-        max_iterations=-1,
-        label="points",
-    )[1:]
+    state = (mi.UInt32(0), *[mi.Float(0) for _ in directions])
+    totals = symbolic_loop(state, lambda k, *_: active & (k < count), body, "points")[1:]
     return [total * share for total in totals]
 
 
@@ -580,10 +574,10 @@ def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
     of area/12 along either axis.
     """
     if kernel.kernel == "box":
-        return (dr.square(d1 * kernel.reach_u) + dr.square(d2 * kernel.reach_v)) / 3
+        return (dr.square(d1 * kernel.half_u) + dr.square(d2 * kernel.half_v)) / 3
     stretch = kernel.sigma_u_given_v / kernel.sigma_v
     across = dr.square(d1) * stretch + dr.square(dr.fma(d1, kernel.shear, d2)) / stretch
-    return across / (12 * kernel.value(offset))
+    return across / (12 * kernel.value(offset, edge=False))
 
 
 # ------------------------------------------------------------------------------------------------

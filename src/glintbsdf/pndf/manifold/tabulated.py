@@ -26,6 +26,7 @@ import numpy as np
 
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
@@ -230,9 +231,7 @@ class TabulatedManifold(Manifold):
             return y, x, last, active & (y <= bottom), *state
 
         state = (y, x, last, mi.Bool(active) & (y <= bottom), *state)
-        return dr.while_loop(
-            state, lambda *state: state[3], body, max_iterations=-1, label="every node"
-        )[4:]
+        return symbolic_loop(state, lambda *state: state[3], body, "every node")[4:]
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), see :class:`Manifold`: piecewise constant over bins where tables are used."""

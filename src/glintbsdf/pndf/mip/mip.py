@@ -23,6 +23,7 @@ import numpy as np
 from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check, check_whole, warn
 from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
@@ -288,14 +289,8 @@ class Mip(PNDF):
             mi.Vector2i(0),
             mi.Vector2i(1),
         )
-        state, _ = dr.while_loop(
-            (state, walk),
-            lambda state, walk: active & (walk[4] <= bottom),
-            body,
-            max_iterations=-1,
-            label="lobes",
-        )
-        return state
+        more = lambda state, walk: active & (walk[4] <= bottom)  # noqa: E731
+        return symbolic_loop((state, walk), more, body, "lobes")[0]
 
     # --------------------------------------------------------------------------------------------
     #  Section 5.2.2: evaluation and sampling

@@ -1,0 +1,192 @@
+"""Loops that sum, and their derivatives.
+
+A loop of Dr.Jit (1.5) whose sums are differentiable, ``dr.while_loop(…, max_iterations=-1)``, keeps
+the derivatives of its state and of what it gathers. Those of a value that its body uses without
+being given it, and that was computed in a recorded call, as all are in a BSDF inside of an
+integrator's loop, it drops without a word. So :func:`symbolic_loop` finds these values by itself,
+wherever the body keeps them, and makes them part of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from functools import partial
+from types import CellType, FunctionType, MethodType, ModuleType
+
+import drjit as dr
+
+
+def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str) -> tuple:
+    """Run a loop as part of a kernel: while ``condition(*state)`` holds, ``state = body(*state)``.
+
+    Differentiable in both modes where all of the state that carries derivatives is a sum, only
+    added to, or is left as it is; any other loop belongs in a block of ``dr.suspend_grad``. The
+    body may use any values of the functions around it, and may hold further loops.
+
+    Args:
+        state: tuple of Dr.Jit arrays, or containers of them; the result is alike.
+        label: name of the loop in what Dr.Jit reports.
+    """
+    captured = Captured(body)
+    width, count = dr.width((*state, *captured.values)), len(state)
+    # Of one width: in nested loops, Dr.Jit cannot sum up the derivatives of a narrower one.
+    values = [value + dr.zeros(type(value), width) for value in captured.values]
+
+    def body_with_values(*state):
+        state, values = state[:count], state[count:]
+        return *captured.function_with(values)(*state), *values
+
+    # Mitsuba switches symbolic loops off to differentiate, and Dr.Jit warns of each in a call.
+    return dr.while_loop(
+        (*state, *values),
+        lambda *state: condition(*state[:count]),
+        body_with_values if values else body,
+        mode="symbolic",
+        max_iterations=-1,
+        label=label,
+    )[:count]
+
+
+class Captured:
+    """The arrays with derivatives that a function uses without being given them.
+
+    They are looked for in the variables of enclosing functions, in the objects and the functions
+    that these hold, and so on. Arrays in memory stay where they are: Dr.Jit does not lose them, and
+    those that are gathered from have sizes of their own.
+
+    Attributes:
+        values (list): the arrays.
+    """
+
+    def __init__(self, function: Callable) -> None:
+        self.function, self.values = function, []
+        self.places = {}
+
+        def find(array):
+            computed = array.state != dr.VarState.Evaluated
+            if computed and dr.grad_enabled(array) and identity(array) not in self.places:
+                self.places[identity(array)] = len(self.values)
+                self.values.append(array)
+            return array
+
+        mapped(function, find, {})
+
+    def function_with(self, values) -> Callable:
+        """The function, using these ``values`` in place of its own."""
+
+        def replace(array):
+            place = self.places.get(identity(array))
+            return array if place is None else values[place]
+
+        return mapped(self.function, replace, {})
+
+
+def identity(array) -> tuple[int, int]:
+    """The same for arrays that are one and the same variable, with the same derivatives."""
+    return array.index, array.index_ad
+
+
+# ------------------------------------------------------------------------------------------------
+#  Going through what a function uses
+# ------------------------------------------------------------------------------------------------
+
+
+def mapped(thing: object, replace: Callable, done: dict) -> object:
+    """``thing`` with ``replace`` applied to all arrays in it: itself if none changes, else a copy.
+
+    Looks into containers, functions and their enclosing variables, objects and their attributes.
+    ``done``: what has been met so far, by identity, and what became of it.
+    """
+    if id(thing) in done:
+        return done[id(thing)][1]
+    done[id(thing)] = thing, thing  # the first keeps the identity from being used again
+    if dr.is_array_v(thing) and dr.depth_v(thing) == 1 and not dr.is_tensor_v(thing):
+        result = replace(thing)
+    else:
+        parts, remade = taken_apart(thing)
+        new = [mapped(part, replace, done) for part in parts]
+        unchanged = all(a is b for a, b in zip(new, parts, strict=True))
+        result = thing if unchanged else remade(new)
+    done[id(thing)] = thing, result
+    return result
+
+
+def taken_apart(thing: object) -> tuple[list, Callable]:
+    """The parts of a thing, and the function that makes its like of other parts."""
+    kind = type(thing)
+    if dr.is_array_v(thing):
+        parts = [] if dr.is_tensor_v(thing) else list(thing)
+        return parts, lambda new: with_items(kind(thing), enumerate(new))
+    if isinstance(thing, tuple | list):
+        return list(thing), getattr(kind, "_make", kind)
+    if kind is dict:
+        return list(thing.values()), lambda new: dict(zip(thing, new, strict=True))
+    if kind is MethodType:
+        return [thing.__self__], lambda new: MethodType(thing.__func__, *new)
+    if kind is partial:
+        return [thing.func, thing.args, thing.keywords], lambda new: partial(
+            new[0], *new[1], **new[2]
+        )
+    if kind is FunctionType:
+        return function_taken_apart(thing)
+    fields = getattr(kind, "DRJIT_STRUCT", None)  # of Mitsuba's interactions, for example
+    if fields and not isinstance(thing, type):
+        parts = [getattr(thing, name) for name in fields]
+        return parts, lambda new: with_attributes(kind(thing), zip(fields, new, strict=True))
+    if keeps_attributes(thing):
+        names = list(vars(thing))
+        return list(vars(thing).values()), lambda new: with_attributes(
+            copy(thing), zip(names, new, strict=True)
+        )
+    return [], lambda new: thing
+
+
+def function_taken_apart(function: FunctionType) -> tuple[list, Callable]:
+    """The default arguments and enclosing variables of a function; see :func:`taken_apart`."""
+    cells = [cell for cell in function.__closure__ or () if is_set(cell)]
+
+    def remade(new):
+        defaults, *contents = new
+        cell_of = {id(cell): CellType(part) for cell, part in zip(cells, contents, strict=True)}
+        closure = tuple(cell_of.get(id(cell), cell) for cell in function.__closure__ or ())
+        result = FunctionType(
+            function.__code__, function.__globals__, function.__name__, defaults, closure
+        )
+        result.__kwdefaults__ = function.__kwdefaults__
+        return result
+
+    return [function.__defaults__, *(cell.cell_contents for cell in cells)], remade
+
+
+def is_set(cell: CellType) -> bool:
+    """Whether an enclosing variable has a value yet."""
+    try:
+        cell.cell_contents  # noqa: B018
+    except ValueError:
+        return False
+    return True
+
+
+def keeps_attributes(thing: object) -> bool:
+    """Whether an object's state is its attributes of Python: not so with plugins of Mitsuba, the
+    other half of which is written in C++, nor with classes and modules."""
+    return (
+        hasattr(thing, "__dict__")
+        and not isinstance(thing, type | ModuleType)
+        and not any(base.__module__.startswith("mitsuba") for base in type(thing).__mro__)
+    )
+
+
+def with_items(thing, items):
+    """``thing``, once these items have been set."""
+    for key, value in items:
+        thing[key] = value
+    return thing
+
+
+def with_attributes(thing, attributes):
+    """``thing``, once these attributes have been set."""
+    for name, value in attributes:
+        object.__setattr__(thing, name, value)
+    return thing

@@ -1,0 +1,169 @@
+"""Loops keep the derivatives of what their bodies capture, wherever they run."""
+
+from __future__ import annotations
+
+from functools import partial
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from glintbsdf.core.loops import Captured, symbolic_loop
+
+TURNS = 5
+
+
+def count_and_add(term, zero):
+    """Σ term(k) over k = 0 … TURNS − 1, beginning with ``zero``."""
+
+    def body(k, total):
+        return k + 1, total + term(mi.Float(k))
+
+    return symbolic_loop((mi.UInt32(0), zero), lambda k, _: k < TURNS, body, "sum")[1]
+
+
+def by_variable(x):
+    y = x * x
+    return count_and_add(lambda k: k * y, mi.Float(0))
+
+
+def by_vector(x):
+    y = mi.Vector2f(x * x, 1)
+    return count_and_add(lambda k: k * y, mi.Vector2f(0)).x
+
+
+def by_object(x):
+    kernel = SimpleNamespace(scales=[x * x], name="kernel")
+    return count_and_add(lambda k: k * kernel.scales[0], mi.Float(0))
+
+
+def by_method(x):
+    class Kernel:
+        def value(self, k):
+            return k * self.scale
+
+    kernel = Kernel()
+    kernel.scale = x * x
+    return count_and_add(kernel.value, mi.Float(0))
+
+
+def by_interaction(x):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.uv = mi.Point2f(0, x * x)
+    return count_and_add(lambda k: k * si.uv.y, mi.Float(0))
+
+
+def by_matrix(x):
+    y = mi.Matrix2f(1, x * x, 2, 3)
+    return count_and_add(lambda k: k * (y @ mi.Vector2f(0, 1)).x, mi.Float(0))
+
+
+def by_partial(x):
+    return count_and_add(partial(lambda y, k: k * y, x * x), mi.Float(0))
+
+
+def by_default(x):
+    return count_and_add(lambda k, y=x * x: k * y, mi.Float(0))
+
+
+def by_function(x):
+    y = x * x
+
+    def scaled(k):
+        return k * y
+
+    return count_and_add(lambda k: scaled(k), mi.Float(0))
+
+
+def by_nested_loop(x):
+    """Σ_j Σ_k (j + k) x² / TURNS, less what is there in excess of Σ k x²."""
+    y = x * x
+
+    def inner(j):
+        return count_and_add(lambda k: (k + j) * y, mi.Float(0)) / TURNS
+
+    return count_and_add(inner, mi.Float(0)) - sum(range(TURNS)) * y
+
+
+FORMS = [by_variable, by_vector, by_matrix, by_object, by_method, by_interaction, by_partial,
+         by_default, by_function, by_nested_loop]  # fmt: skip
+FACTOR = sum(range(TURNS))
+
+
+def in_a_call(function, x):
+    """The function in a recorded call in a recorded loop, as a BSDF in an integrator."""
+
+    def body(n, total):
+        index = mi.UInt32(dr.opaque(mi.UInt32, 0))
+        return n + 1, total + dr.switch(index, [function, lambda x: x], x * 1.5)
+
+    state = mi.UInt32(0), mi.Float(0)
+    return dr.while_loop(state, lambda n, _: n < 2, body, max_iterations=-1)[1]
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize("function", FORMS)
+def test_derivative_of_what_is_captured(variant, function, mode):
+    x = dr.opaque(mi.Float, 0.7)
+    dr.enable_grad(x)
+    y = in_a_call(function, x)
+    if mode == "forward":
+        dr.forward(x)
+        derivative = dr.grad(y)
+    else:
+        dr.backward(y)
+        derivative = dr.grad(x)
+    assert dr.allclose(y, 2 * FACTOR * (1.5 * 0.7) ** 2)
+    assert dr.allclose(derivative, 2 * FACTOR * 2 * 1.5**2 * 0.7)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_narrow_values_in_nested_loops(variant, mode):
+    """Of three lanes, with a derivative that all have in common."""
+    x = mi.Float(0.7)
+    dr.enable_grad(x)
+    y = by_nested_loop(x) * mi.Float(1, 2, 3)
+    common = dr.square(x)
+    y = y + count_and_add(lambda j: count_and_add(lambda k: common, mi.Float(0, 0, 0)), mi.Float(0))
+    expected = 2 * 0.7 * (FACTOR * np.array([1, 2, 3]) + TURNS**2)
+    if mode == "forward":
+        dr.forward(x)
+        assert dr.allclose(dr.grad(y), expected)
+    else:
+        dr.backward(dr.sum(y))
+        assert dr.allclose(dr.grad(x), expected.sum())
+
+
+@pytest.mark.parametrize("function", FORMS)
+def test_value_without_derivatives(variant, function):
+    assert dr.allclose(function(mi.Float(0.7)), FACTOR * 0.49)
+
+
+def test_arrays_in_memory_stay_where_they_are(variant):
+    """What is gathered from has a size of its own."""
+    table = mi.Float([1, 2, 3, 4, 5])
+    dr.enable_grad(table)
+    total = count_and_add(lambda k: dr.gather(mi.Float, table, mi.UInt32(k)), mi.Float(0))
+    dr.backward(total)
+    assert dr.allclose(total, 15) and dr.allclose(dr.grad(table), 1)
+    assert Captured(lambda: table).values == []
+
+
+def test_nothing_is_moved_without_derivatives(variant):
+    y = mi.Float(2) * 3
+    function = lambda: y  # noqa: E731
+    captured = Captured(function)
+    assert captured.values == [] and captured.function_with([]) is function
+
+
+def test_a_function_that_refers_to_itself(variant):
+    x = mi.Float(2)
+    dr.enable_grad(x)
+    y = x * x
+
+    def term(k, again=True):
+        return term(k, False) if again else k * y
+
+    assert len(Captured(term).values) == 1
