@@ -28,7 +28,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.footprint.domain import waiting
 from glintbsdf.scene.inspection import Inspected, Trimmed
 from glintbsdf.scene.merging import Results
 from glintbsdf.scene.package import (
@@ -144,12 +143,8 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
     if mi.variant() != job.variant:
         mi.set_variant(job.variant)
     with _spare_thread(threads):
-        if job.trim:
-            with waiting() as bsdfs:
-                inspected = Inspected(job.package.load(store), bsdfs)
-            scene, missed = inspected.scene, Trimmed(inspected, job.spp).missed
-        else:
-            scene, missed = job.package.load(store), lambda: False
+        scene = job.package.load(store, deferred=job.trim)
+        missed = Trimmed(Inspected.of(scene), job.spp).missed if job.trim else lambda: False
     with ExitStack() as stack:
         renderer = stack.enter_context(Renderer(scene, job.spp, job.denoise, missed))
         _loaded[job] = renderer, stack.pop_all()

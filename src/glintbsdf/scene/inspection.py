@@ -36,11 +36,15 @@ class Inspected:
     scene: mi.Scene
     bsdfs: list
 
+    @staticmethod
+    def of(scene: mi.Scene) -> Inspected:
+        """A scene that was loaded deferred."""
+        return Inspected(scene, rendering.glint_bsdfs(scene))
+
 
 def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> Inspected:
     """Load a scene from XML, its glint BSDFs not yet built."""
-    scene = rendering.load_scene(filename, parameters, deferred=True)
-    return Inspected(scene, rendering.glint_bsdfs(scene))
+    return Inspected.of(rendering.load_scene(filename, parameters, deferred=True))
 
 
 def survey(inspected: Inspected, spp: int | None = None) -> list[Domain | None]:

@@ -21,6 +21,8 @@ from pathlib import Path, PurePosixPath
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.scene import rendering
+
 _DIGEST = re.compile(r"[0-9a-f]{40}")
 _SUFFIX = re.compile(r"(\.[A-Za-z0-9_]{1,16})?")
 
@@ -181,11 +183,12 @@ class Package:
         """
         path = Path(filename).absolute()
         definitions = dict(definitions or {})
-        _, state = _parsed(path, definitions)
+        config = mi.parser.ParserConfig(mi.variant())
+        state = mi.parser.parse_file(config, str(path), **definitions)
         documents = [Path(str(name)).resolve() for name in state.files]
         root = Path(os.path.commonpath([document.parent for document in documents]))
         files = {}
-        for _, _, value in _strings(state):
+        for _, _, value in rendering.strings(state):
             if value not in files and (found := _find(value, path.parent)) is not None:
                 files[value] = Content.of(found)
         return Package(
@@ -213,8 +216,8 @@ class Package:
         """Files that must be sent."""
         return [content for content in self.contents if store.find(content) is None]
 
-    def load(self, store: Store) -> mi.Scene:
-        """Load the scene, of which nothing is missing.
+    def load(self, store: Store, deferred: bool = False) -> mi.Scene:
+        """Load the scene, of which nothing is missing; see :func:`.load_scene`.
 
         Raises:
             BadPackage: a name leads out of the folder.
@@ -226,12 +229,7 @@ class Package:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(store.find(content).read_bytes())
             main = inside(Path(folder), self.documents[0][0])
-            config, state = _parsed(main, dict(self.definitions))
-            for node, key, value in _strings(state):
-                if value in files:
-                    node.props[key] = files[value]
-            mi.parser.transform_all(config, state)
-            return mi.parser.instantiate(config, state)
+            return rendering.load_scene(main, dict(self.definitions), deferred, files)
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -245,22 +243,6 @@ def inside(folder: Path, name: str) -> Path:
     if bad or not (folder / pure).resolve().is_relative_to(folder.resolve()):
         raise BadPackage(f"the name {name!r} leads out of the folder for files")
     return folder / pure
-
-
-def _parsed(
-    path: Path, definitions: Mapping[str, str]
-) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    config = mi.parser.ParserConfig(mi.variant())
-    return config, mi.parser.parse_file(config, str(path), **definitions)
-
-
-def _strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str, str]]:
-    """All strings of a parsed scene: the node, the property's name, its value."""
-    for node in state.nodes:
-        for key in list(node.props.keys()):
-            value = node.props[key]
-            if isinstance(value, str):
-                yield node, key, value
 
 
 def _find(value: str, folder: Path) -> Path | None:

@@ -34,8 +34,11 @@ def load_scene(
     filename: str | Path,
     parameters: Mapping[str, str] | None = None,
     deferred: bool = False,
+    files: Mapping[str, str] | None = None,
 ) -> mi.Scene:
     """Load a scene from XML. ``parameters`` takes the place of its ``$key`` and ``<default>``.
+
+    ``files`` says where files are that the scene names otherwise.
 
     With ``deferred``, its glint BSDFs build nothing yet: :func:`glint_bsdfs` finds them, and their
     ``build`` is called for what the scene asks of them.
@@ -46,17 +49,29 @@ def load_scene(
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
     parameters = dict(parameters or {})
-    if not deferred:
+    if not deferred and not files:
         return mi.load_file(str(filename), **parameters)
     config = mi.parser.ParserConfig(mi.variant())
     with folder_of_files(Path(filename).resolve().parent):
         state = mi.parser.parse_file(config, str(filename), **parameters)
+        for node, key, value in strings(state):
+            if files and value in files:
+                node.props[key] = files[value]
         mi.parser.transform_all(config, state)
         for node in state.nodes:
-            if node.props.plugin_name() in DEFERRABLE:
+            if deferred and node.props.plugin_name() in DEFERRABLE:
                 node.props["deferred"] = True
         scene = mi.parser.instantiate(config, state)
     return scene if isinstance(scene, mi.Scene) else scene[0]
+
+
+def strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str, str]]:
+    """All strings of a parsed scene: the node, the property's name, its value."""
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            value = node.props[key]
+            if isinstance(value, str):
+                yield node, key, value
 
 
 #: Plugins that build their structures late where a scene is loaded for that.
