@@ -153,7 +153,8 @@ class GlintDiffuse(FootprintBSDF):
         query = self.query(si, active)
         white = wo.z * (1 / pi)  # as long as nothing is built
         if self.method is not None:
-            white = self.method.eval(wi, wo, ctx.mode, query, active)
+            frame = self.slope_frame(si)
+            white = self.method.eval(wi, wo, ctx.mode, query, active, frame)
         value = dr.select(active, self.reflectance.eval(si, active) * white, 0)
         pdf = dr.select(active, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
         return mi.mueller.depolarizer(value) if mi.is_polarized else value, pdf

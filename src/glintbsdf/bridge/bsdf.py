@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.bridge.parameters import Parameters, check_to_uv
+from glintbsdf.bridge.parameters import Number, Parameters, check_to_uv, declared
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
@@ -20,11 +20,10 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap
 from glintbsdf.microfacet.interface import Component, Mirror
 from glintbsdf.microfacet.masking import SmithMasking
+from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.base import PNDF
+from glintbsdf.pndf.displaced import Displaced, DisplacedMasking
 from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
-
-#: The most that footprint_sigma and pixel_spread may be set to after loading.
-LARGEST = 1e4
 
 
 class FootprintBSDF(mi.BSDF):
@@ -87,12 +86,12 @@ class FootprintBSDF(mi.BSDF):
             check_to_uv(self.owner, self.to_uv)
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):
             value = getattr(self, key)
-            # Passes of a rendering take pixel_spread beyond the range of its declaration.
+            allowed = declared(self.owner, key) or Number()
             check(
-                dr.all((value >= 0) & (value <= LARGEST)),
+                dr.all((value >= allowed.minimum) & (value <= allowed.maximum)),
                 self.owner,
                 key,
-                f"a finite number from 0 to {LARGEST:g}",
+                str(allowed),
                 value,
             )
 
@@ -141,6 +140,14 @@ class FootprintBSDF(mi.BSDF):
         doubt = doubt_of_green(self.normal_map, self.to_uv, shapes)
         if doubt:
             mi.Log(mi.LogLevel.Warn, f'{self.owner} "{self.name}": {doubt}')
+
+    def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:
+        """How slopes of a height map lie on the surface at ``si``; None for a map of normals, which
+        are read in the shading frame as Mitsuba's ``normalmap`` reads them."""
+        if self.normal_map is None or not self.normal_map.is_height:
+            return None
+        height, width, wrap_mode = self.map_shape
+        return SlopeFrame.from_interaction(si, self.to_uv, width, height, wrap_mode == "mirror")
 
     def query(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Query:
         """All that an evaluation at ``si`` asks of the P-NDF; made once for each."""
@@ -270,12 +277,18 @@ class GlintBSDF(FootprintBSDF):
     #  Mitsuba's interface
     # ----------------------------------------------------------------------------------------------
 
-    def facets(self, ctx: mi.BSDFContext) -> tuple[PNDF, SmithMasking | None]:
-        """The facets that reflect, and their masking: the glints, or their smooth counterpart where
-        ``ctx`` asks for it."""
-        if self.pndf is None or (self.smooth is not None and asks_for_smooth_lobes(ctx)):
-            return self.smooth, self.smooth_masking
-        return self.pndf, self.masking
+    def facets(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f
+    ) -> tuple[PNDF, SmithMasking | None]:
+        """The facets that reflect at ``si``, and their masking: the glints, or their smooth
+        counterpart where ``ctx`` asks for it."""
+        pndf, masking = self.pndf, self.masking
+        if pndf is None or (self.smooth is not None and asks_for_smooth_lobes(ctx)):
+            pndf, masking = self.smooth, self.smooth_masking
+        frame = self.slope_frame(si)
+        if frame is None:
+            return pndf, masking
+        return Displaced(pndf, frame), masking and DisplacedMasking(masking, frame)
 
     def components(self, ctx: mi.BSDFContext) -> list[tuple[int, Component]]:
         """The components that ``ctx`` asks for, with their indices."""
@@ -303,7 +316,7 @@ class GlintBSDF(FootprintBSDF):
         # Draw a normal and scatter at it. One that does not point up, or scatters to the wrong side
         # of the surface, is an invalid sample: its mass is missing from the pdf as well.
         query = self.query(si, active)
-        pndf, masking = self.facets(ctx)
+        pndf, masking = self.facets(ctx, si)
         m = pndf.sample_visible(wi, query, sample1, sample2, active)
         wo, active = component.scattered(wi, m, active)
         density = self.density(pndf, m, query, si, active)
@@ -349,7 +362,7 @@ class GlintBSDF(FootprintBSDF):
         active, wi, wo = component.above_horizon(active, si.wi, wo)
         m = component.half_vector(wi, wo)
         query = self.query(si, active)
-        pndf, masking = self.facets(ctx)
+        pndf, masking = self.facets(ctx, si)
         density = self.density(pndf, m, query, si, active)
         value = component.value(density, wi.z)
         pdf = pndf.visible_pdf(wi, m, density, query, active)

@@ -28,6 +28,7 @@ import numpy as np
 
 from glintbsdf.core.errors import ParameterError, check, check_choice
 from glintbsdf.maps.normalmap import ENCODINGS, MAP_TYPES, WRAP_MODES, NormalMap
+from glintbsdf.maps.reading import is_file
 from glintbsdf.microfacet.interface import Conductor, Dielectric, Interface, Mirror
 
 MAP_SOURCES = ("filename", "bitmap", "data")
@@ -337,7 +338,7 @@ class Parameters:
         bitmap = value
         if isinstance(value, str):
             path = Path(str(mi.file_resolver().resolve(value)))
-            check(path.is_file(), self.owner, name, requirement, value)
+            check(is_file(path), self.owner, name, requirement, value)
             try:
                 bitmap = mi.Bitmap(str(path))
             except RuntimeError as error:

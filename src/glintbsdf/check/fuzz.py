@@ -172,7 +172,7 @@ def made(kind: str, value: Any) -> Any:
 
     number = float(value) if isinstance(value, int | float) else 0.0
     with np.errstate(over="ignore"):
-        pixels = np.full((4, 4, 3), number).astype(np.float32)
+        pixels = np.full((16, 16, 3), number).astype(np.float32)
     makers: dict[str, Callable[[], Any]] = {
         "colour": lambda: mi.ScalarColor3d(number, 0.5, 0.2),
         "vector": lambda: mi.ScalarVector3d(number, 1, 2),

@@ -30,12 +30,17 @@ SIGNIFICANCE = 0.01
 
 @dataclass(frozen=True)
 class View:
-    """A direction of view and a footprint: its mean and its axes (standard deviations), in UV."""
+    """A direction of view and a footprint: its mean and its axes (standard deviations), in UV.
+
+    ``dp_du`` and ``dp_dv``: how UVs lie on the plane.
+    """
 
     uv: Pair = (0.37, 0.61)
     du: Pair = (0.0, 0.0)
     dv: Pair = (0.0, 0.0)
     wi: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    dp_du: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    dp_dv: tuple[float, float, float] = (0.0, 1.0, 0.0)
 
     def interaction(self, count: int = 1) -> mi.SurfaceInteraction3f:
         """``count`` equal surface interactions on the plane z = 0."""
@@ -43,8 +48,9 @@ class View:
         si.uv, si.duv_dx, si.duv_dy = self.uv, self.du, self.dv
         si.wi = dr.normalize(mi.Vector3f(self.wi))
         si.t, si.n = 1, mi.Normal3f(0, 0, 1)
-        si.sh_frame = mi.Frame3f(mi.Vector3f(si.n))
-        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        si.dp_du, si.dp_dv = mi.Vector3f(self.dp_du), mi.Vector3f(self.dp_dv)
+        s = dr.normalize(si.dp_du)
+        si.sh_frame = mi.Frame3f(s, dr.cross(si.n, s), si.n)
         if mi.is_spectral:
             si.wavelengths = [440, 510, 580, 650]
         dr.make_opaque(si)  # one compiled kernel serves all views

@@ -40,7 +40,7 @@ from glintbsdf.maps.decoding import (
     check_texels,
     curl,
 )
-from glintbsdf.maps.reading import Picture, read
+from glintbsdf.maps.reading import Picture, is_file, read
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -194,7 +194,7 @@ class NormalMap:
         :class:`~.ParameterError` where the file is missing, unreadable, or holds no valid map.
         """
         path = Path(filename)
-        check(path.is_file(), owner, "filename", "the name of an existing file", str(filename))
+        check(is_file(path), owner, "filename", "the name of an existing file", str(filename))
         check_choice(owner, "map_type", map_type, MAP_TYPES)
         picture = read(path, map_type, layer, owner)
         data = _as_array(picture.data, owner, "filename")

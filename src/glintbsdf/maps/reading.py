@@ -41,6 +41,14 @@ class Picture:
     note: str = ""
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file of this name, which may be none that the system can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long for the system, or with a null in it
+        return False
+
+
 def read(path: Path, map_type: str, layer: str, owner: str) -> Picture:
     """Read an image file by the library that reads its kind best.
 

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.query import Query
+from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.filters.moments import MomentPyramid
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import LOWEST, ProjectedArea
@@ -37,8 +38,24 @@ class FacetDiffuse:
         """Follow a change of the mesh's data."""
         self.area.parameters_changed()
 
-    def eval(self, wi, wo, mode: mi.TransportMode, query: Query, active: mi.Bool) -> mi.Float:
-        """``f_d cosθ_o``. The light is at ``wo``, or at ``wi`` where importance is transported."""
+    def eval(
+        self,
+        wi,
+        wo,
+        mode: mi.TransportMode,
+        query: Query,
+        active: mi.Bool,
+        frame: SlopeFrame | None = None,
+    ) -> mi.Float:
+        """``f_d cosθ_o``. The light is at ``wo``, or at ``wi`` where importance is transported.
+
+        ``frame``: how slopes of a height map lie on the surface. Facets seen from ω are those that
+        its ω′ sees in the map, and P(ω)/ω_z = P′(ω′)/ω′_z.
+        """
+        if frame is not None:
+            seen_i, seen_o = frame.direction_to_map(wi), frame.direction_to_map(wo)
+            own = self.eval(seen_i, seen_o, mode, query, active)
+            return own * (wo.z / seen_o.z)
         if mode == mi.TransportMode.Importance:
             return self.area.eval(wi, query, active) * wo.z / (pi * wi.z)
         return self.area.eval(wo, query, active) / pi
@@ -81,16 +98,32 @@ class OrenNayarDiffuse:
             domain=self.domain,
         )
 
-    def eval(self, wi, wo, mode: mi.TransportMode, query: Query, active: mi.Bool) -> mi.Float:
+    def eval(
+        self,
+        wi,
+        wo,
+        mode: mi.TransportMode,
+        query: Query,
+        active: mi.Bool,
+        frame: SlopeFrame | None = None,
+    ) -> mi.Float:
         """``f cosθ_o``; zero where either direction is below the mean facet.
 
         The model is reciprocal about the mean normal, but cosθ_o is that to the surface, as inside
         ``normalmap``: where importance is transported, directions change places.
+
+        ``frame``: how slopes of a height map lie on the surface. Their variance is taken to be the
+        same in all directions of the map.
         """
         x, y, slope_x, slope_y, squared = self.pyramid.average(query)
         variance = 0.5 * dr.maximum(squared - slope_x * slope_x - slope_y * slope_y, 0)
-        frame = mi.Frame3f(mi.Normal3f(x, y, dr.safe_sqrt(1 - x * x - y * y)))
-        local_i, local_o = frame.to_local(wi), frame.to_local(wo)
+        normal = mi.Vector3f(x, y, dr.safe_sqrt(1 - x * x - y * y))
+        if frame is not None:
+            normal = frame.normal_from_map(normal)
+            entries = [frame.matrix[i, j] for i in range(2) for j in range(2)]
+            variance = variance * (0.5 * sum(entry * entry for entry in entries))
+        mean = mi.Frame3f(mi.Normal3f(normal))
+        local_i, local_o = mean.to_local(wi), mean.to_local(wo)
         if mode == mi.TransportMode.Importance:
             return oren_nayar(local_o, local_i, variance) * (wo.z / wi.z)
         return oren_nayar(local_i, local_o, variance)
