@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,25 @@ def test_a_full_disk_stays_as_it_was(folder):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert arrays["a"].sum() == 100_000
     assert not list(folder.iterdir())
+
+
+def slow_build():
+    """Leaves a mark, and takes long enough for others to come."""
+    (cache.directory() / f"built-by-{os.getpid()}").touch()
+    time.sleep(1)
+    return {"a": np.arange(10)}
+
+
+def build_once(_index):
+    return cache.load_or_build(slow_build, "once")["a"].sum()
+
+
+def test_processes_build_once(folder):
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(3) as pool:
+        assert pool.map(build_once, range(3), chunksize=1) == [45, 45, 45]
+    assert len(list(folder.glob("built-by-*"))) == 1
+    assert not list(folder.glob("*.lock"))
 
 
 def hammer(seed):

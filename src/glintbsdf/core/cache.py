@@ -18,7 +18,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -59,9 +59,36 @@ def load_or_build(
     path = folder / f"{_PREFIX}{hashlib.blake2b(key.encode(), digest_size=20).hexdigest()}.npz"
     arrays = _load(path)
     if arrays is None:
-        arrays = dict(build())
-        _store(path, arrays)
+        with _alone(path):
+            arrays = _load(path)  # another process may have built it meanwhile
+            if arrays is None:
+                arrays = dict(build())
+                _store(path, arrays)
     return arrays
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """In the block, no other process of this machine builds ``path``.
+
+    A process that dies gives its place to the next. Where the folder cannot be written, everybody
+    builds.
+    """
+    import filelock
+
+    lock = filelock.FileLock(path.with_suffix(".lock"))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except (OSError, NotImplementedError):
+        yield
+        return
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            Path(lock.lock_file).unlink(missing_ok=True)  # who waits for it may still have it
+        lock.release()
 
 
 @functools.cache
