@@ -1,4 +1,4 @@
-"""The command line: ``glintbsdf render``, ``pndf``, ``inspect``, ``synthesise`` and ``doctor``.
+"""The command line: ``render``, ``sequence``, ``pndf``, ``inspect``, ``synthesise``, ``doctor``.
 
 Only what concerns the terminal is here; the work is done in other modules.
 """
@@ -24,6 +24,7 @@ from glintbsdf.core.interruption import interruptible
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.scene import inspection, rendering
+from glintbsdf.scene import sequence as frames
 
 Definitions = tuple[str, ...]
 
@@ -130,6 +131,35 @@ def _define_option(meaning: str):
     )
 
 
+def _image_options(command):
+    """Options of all commands that render images."""
+    for option in reversed(
+        [
+            _variant_option,
+            click.option(
+                "--spp",
+                type=click.IntRange(min=1),
+                help="Samples per pixel.  [default: the scene's]",
+            ),
+            click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True),
+            click.option(
+                "--denoise",
+                is_flag=True,
+                help="Denoise the indirect light; direct light, and so all glints, stay as they "
+                'are. Needs the integrator "glint_path".',
+            ),
+            click.option(
+                "--trim",
+                is_flag=True,
+                help="Build no more of the maps' structures than the scene asks for, which a "
+                "survey with few samples finds out. The image is the same.",
+            ),
+        ]
+    ):
+        command = option(command)
+    return command
+
+
 # ---------------------------------------------------------------------------------------------
 #  Commands
 # ---------------------------------------------------------------------------------------------
@@ -144,23 +174,7 @@ def _define_option(meaning: str):
     callback=parse_image,
     help="Image to write, .exr or .png.  [default: SCENE.exr]",
 )
-@_variant_option
-@click.option(
-    "--spp", type=click.IntRange(min=1), help="Samples per pixel.  [default: the scene's]"
-)
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True)
-@click.option(
-    "--denoise",
-    is_flag=True,
-    help="Denoise the indirect light; direct light, and so all glints, stay as they are. Needs the "
-    'integrator "glint_path".',
-)
-@click.option(
-    "--trim",
-    is_flag=True,
-    help="Build no more of the maps' structures than the scene asks for, which a survey with few "
-    "samples finds out. The image is the same.",
-)
+@_image_options
 @_define_option("Parameter of the scene; may be repeated.")
 @making_options
 def render(
@@ -184,6 +198,90 @@ def render(
     subject = Subject(scene, definitions, variant, spp, seed, denoise, trim)
     with where.cluster(variant) as cluster:
         make(subject, output or scene.with_suffix(".exr"), where, cluster)
+
+
+@commands.command()
+@click.argument("scene", type=_file)
+@click.option(
+    "-o",
+    "template",
+    metavar="NAMES",
+    help="Images to write, .exr or .png; {index} and the names of parameters are filled in.  "
+    "[default: SCENE_{index:04}.exr]",
+)
+@_image_options
+@_define_option(
+    "Parameter of the scene; may be repeated. first:last:count makes frames of evenly spaced "
+    "values; several such ranges make all combinations."
+)
+@click.option("--table", type=_file, help="CSV file of parameters, a row for each frame.")
+@click.option("--together", is_flag=True, help="Ranges go on together, frame by frame.")
+@click.option(
+    "--sheet",
+    type=click.Path(path_type=Path),
+    callback=parse_image,
+    help="Image to write of all frames side by side; of two ranges, a row for each value of the "
+    "first.",
+)
+@click.option(
+    "--video",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Video to write of all frames, such as out.mp4. Needs ffmpeg.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(min=0, min_open=True),
+    default=24,
+    show_default=True,
+    help="Frames of the video per second.",
+)
+@making_options
+def sequence(
+    scene: Path,
+    template: str | None,
+    definitions: dict[str, str],
+    table: Path | None,
+    together: bool,
+    sheet: Path | None,
+    video: Path | None,
+    rate: float,
+    variant: str,
+    spp: int | None,
+    seed: int,
+    denoise: bool,
+    trim: bool,
+    **how: object,
+) -> None:
+    """Render frames of the Mitsuba scene SCENE, which differ in its parameters.
+
+    All frames draw the same random numbers. With --checkpoint each frame has a folder of its own in
+    DIR, and frames that are done are not rendered again.
+    """
+    where = Making(**how)
+    template = template or f"{scene.stem}_{{index:04}}.exr"
+    parse_image(None, None, Path(template))
+    rows = frames.read_table(table) if table else []
+    parameters = frames.frames_of(definitions, rows, together)
+    names = frames.names_of(template, parameters)
+    if video:
+        frames.require_ffmpeg()
+    _activate(variant)
+    for folder in {name.parent for name in names}:
+        folder.mkdir(parents=True, exist_ok=True)
+    with where.cluster(variant) as cluster:
+        for index, (values, name) in enumerate(zip(parameters, names, strict=True)):
+            subject = Subject(scene, values, variant, spp, seed, denoise, trim)
+            label = f"Frame {index + 1} of {len(names)}"
+            make(subject, name, where.of_frame(index), cluster, label)
+    if sheet:
+        ranges = [v for v in map(frames.values_of, definitions.values()) if v]
+        columns = len(ranges[-1]) if len(ranges) == 2 and not rows and not together else None
+        with rendering.replacing(sheet) as unfinished:
+            rendering.save(frames.sheet(names, columns), unfinished)
+        click.echo(sheet)
+    if video:
+        frames.write_video(names, video, rate)
+        click.echo(video)
 
 
 @commands.command()

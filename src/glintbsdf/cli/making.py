@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,6 +54,12 @@ class Making:
             raise click.UsageError("TLS needs all of --tls-ca-file, --tls-cert and --tls-key.")
         if any(tls) and self.scheduler is None:
             raise click.UsageError("TLS is for --scheduler.")
+
+    def of_frame(self, index: int) -> Making:
+        """The same for a frame of a sequence, with a checkpoint of its own."""
+        if self.checkpoint is None:
+            return self
+        return replace(self, checkpoint=self.checkpoint / f"frame-{index:06}")
 
     @contextmanager
     def cluster(self, variant: str) -> Iterator[Cluster | None]:

@@ -1,0 +1,240 @@
+"""Sequences: the values of each frame's parameters, the names of images, all of them on a sheet or
+in a video."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import itertools
+import math
+import re
+import shutil
+import string
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+#: Width and height of an image on a sheet, at most; pixels.
+THUMBNAIL = 320
+
+_GAP = 4  # pixels between two images on a sheet
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
+
+
+class SequenceError(ValueError):
+    """A sequence cannot be made of what was given; the message says why."""
+
+
+# ------------------------------------------------------------------------------------------------
+#  Values
+# ------------------------------------------------------------------------------------------------
+
+
+def values_of(text: str) -> list[str] | None:
+    """The values of a range ``first:last:count``, both ends included; None for other texts.
+
+    Raises:
+        SequenceError: the range is empty.
+    """
+    match = _RANGE.fullmatch(text)
+    if not match:
+        return None
+    first, last, count = float(match[1]), float(match[2]), int(match[3])
+    if count < 1:
+        raise SequenceError(f"a range has one value at least (got {text})")
+    return [f"{value:.9g}" for value in np.linspace(first, last, count)]
+
+
+def frames_of(
+    definitions: Mapping[str, str],
+    table: Sequence[Mapping[str, str]] = (),
+    together: bool = False,
+) -> list[dict[str, str]]:
+    """The parameters of each frame.
+
+    Args:
+        definitions: of all frames; a value that is a range makes frames.
+        table: parameters of frames, one mapping for each.
+        together: ranges go on together, frame by frame; else frames are made for all combinations,
+            of which the last range changes fastest. A table is one more range, the first.
+
+    Raises:
+        SequenceError: nothing makes frames, or ranges that go on together differ in length, or a
+            parameter is given twice.
+    """
+    common, ranges = {}, []
+    if table:
+        ranges.append([dict(row) for row in table])
+    for key, text in definitions.items():
+        values = values_of(text)
+        if values is None:
+            common[key] = text
+        else:
+            ranges.append([{key: value} for value in values])
+    if not ranges:
+        raise SequenceError("nothing makes frames: give -D key=first:last:count, or --table FILE")
+    twice = [key for row in table for key in row if key in definitions]
+    if twice:
+        raise SequenceError(f'"{twice[0]}" is in the table and in -D')
+    if together and len({len(values) for values in ranges}) > 1:
+        lengths = " and ".join(str(len(values)) for values in ranges)
+        raise SequenceError(f"ranges that go on together have the same length (got {lengths})")
+    steps = zip(*ranges, strict=True) if together else itertools.product(*ranges)
+    return [{**common, **{k: v for part in step for k, v in part.items()}} for step in steps]
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Rows of a table of parameters, separated by commas, semicolons or tabs; names first.
+
+    Raises:
+        SequenceError: there is no row, or one of another length.
+    """
+    text = path.read_text("utf-8-sig")
+    heading = text.partition("\n")[0]
+    delimiter = max(",;\t", key=heading.count)
+    rows = [
+        {(key or "").strip(): value for key, value in row.items()}
+        for row in csv.DictReader(text.splitlines(), delimiter=delimiter)
+    ]
+    for number, row in enumerate(rows):
+        if None in row.values() or "" in row:
+            raise SequenceError(f"{path}: row {number + 2} has not one value for each name")
+    if not rows:
+        raise SequenceError(f"{path} has no rows: the first line names the parameters")
+    return [{key: value.strip() for key, value in row.items()} for row in rows]
+
+
+# ------------------------------------------------------------------------------------------------
+#  Names
+# ------------------------------------------------------------------------------------------------
+
+
+def names_of(template: str, frames: Sequence[Mapping[str, str]]) -> list[Path]:
+    """Files of frames, such as ``{index:04}_{alpha}.exr`` describes them.
+
+    Args:
+        template: with the fields ``index``, from 0, and those parameters that all frames have;
+            numbers may have formats.
+
+    Raises:
+        SequenceError: a field is none of these, or two frames have the same name, or a value would
+            lead into another folder.
+    """
+    fields = {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
+    known = {"index", *set.intersection(*(set(frame) for frame in frames))}
+    if not fields <= known:
+        raise SequenceError(
+            f'the name has a field "{min(fields - known)}"; there are {", ".join(sorted(known))}'
+        )
+    names = []
+    for index, frame in enumerate(frames):
+        used = {key: frame[key] for key in fields - {"index"}}
+        for key, value in used.items():
+            if re.search(r"[/\\:\0]", value) or value in ("", ".", ".."):
+                raise SequenceError(f'"{key}" cannot be part of a name (got "{value}")')
+        try:
+            name = template.format(index=index, **{k: _number(v) for k, v in used.items()})
+        except ValueError as error:
+            raise SequenceError(f"{template}: {error}") from error
+        names.append(Path(name))
+    if len(set(names)) < len(names):
+        raise SequenceError(f"{template} gives several frames the same name; use {{index:04}}")
+    return names
+
+
+def _number(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+# ------------------------------------------------------------------------------------------------
+#  All frames at once
+# ------------------------------------------------------------------------------------------------
+
+
+def colours(path: Path) -> np.ndarray:
+    """The colours of an image file as a screen shows them: (height, width, 3) uint8."""
+    bitmap = mi.Bitmap(str(path))
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        bitmap = bitmap.split()[0][1]
+    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True))
+
+
+def sheet(images: Sequence[Path], columns: int | None = None) -> mi.Bitmap:
+    """All images side by side, made smaller where they are large, row by row.
+
+    Args:
+        columns: in a row; None for about as many as rows.
+    """
+    from skimage.transform import resize
+
+    columns = columns or math.ceil(len(images) ** 0.5)
+    tiles = []
+    for path in images:
+        image = colours(path)
+        scale = min(1.0, THUMBNAIL / max(image.shape[:2]))
+        shape = [max(1, round(size * scale)) for size in image.shape[:2]]
+        if scale < 1:
+            image = resize(image, shape, anti_aliasing=True, preserve_range=True).round()
+        tiles.append(image.astype(np.uint8))
+    height, width = (max(tile.shape[axis] for tile in tiles) + _GAP for axis in range(2))
+    rows = -(-len(tiles) // columns)
+    made = np.full((rows * height - _GAP, columns * width - _GAP, 3), 255, np.uint8)
+    for index, tile in enumerate(tiles):
+        top, left = index // columns * height, index % columns * width
+        made[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+    return mi.Bitmap(made)
+
+
+def require_ffmpeg() -> str:
+    """The program ffmpeg.
+
+    Raises:
+        SequenceError: there is none.
+    """
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise SequenceError("a video needs the program ffmpeg, which is not there")
+    return program
+
+
+def write_video(images: Sequence[Path], path: Path, rate: float) -> None:
+    """Make a video of image files of one size.
+
+    Args:
+        path: its suffix tells ffmpeg the format.
+        rate: frames per second.
+
+    Raises:
+        SequenceError: there is no ffmpeg, or it fails; the message is its last line.
+    """
+    height, width = colours(images[0]).shape[:2]
+    command = [
+        *(require_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"),
+        *("-s", f"{width}x{height}", "-r", str(rate), "-i", "-"),
+        # Many formats want even sizes.
+        *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", str(path)),
+    ]
+    with tempfile.TemporaryFile() as messages:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it has ended, and says why below
+                for image in images:
+                    process.stdin.write(colours(image).tobytes())
+                process.stdin.close()
+            if process.wait():
+                messages.seek(0)
+                lines = messages.read().decode(errors="replace").strip().splitlines()
+                raise SequenceError(f"ffmpeg: {lines[-1] if lines else 'failed'}")
+        finally:
+            process.kill()
+            process.wait()
