@@ -1,1 +1,1 @@
-"""The parts of ``benchmarks/error_vs_time.py``: what is measured, how, and how it is shown."""
+"""How the report of ``error_vs_time`` is shown: fronts, pictures, files, and the page."""

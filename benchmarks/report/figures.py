@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from . import pareto
+from benchmarks.report import pareto
 
 #: Okabe and Ito's colours, told apart by all eyes, and markers, by family in order of appearance.
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#000000", "#999999")
@@ -24,15 +24,9 @@ NOT_TOLD = {"markerfacecolor": "white", "markeredgewidth": 1.2}
 METRICS = {"l1": "relative L1 error", "l2": "relative L2 error", "maximum": "maximum error"}
 
 STYLE = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "glintbsdf",
-    "font.size": 8,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "axes.axisbelow": True,
-    "axes.titlesize": 9,
-    "legend.frameon": False,
-}
+    "svg.fonttype": "none", "svg.hashsalt": "glintbsdf", "font.size": 8, "legend.frameon": False,
+    "axes.grid": True, "grid.color": "#e4e4e4", "axes.axisbelow": True, "axes.titlesize": 9,
+}  # fmt: skip
 
 
 class Palette:
@@ -90,6 +84,11 @@ def legend_below(figure: Figure, handles: dict, panels: int) -> None:
     )
 
 
+def column(points: list[dict], key: str) -> np.ndarray:
+    """An entry of all points."""
+    return np.array([point[key] for point in points])
+
+
 def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: str) -> Figure:
     """Error against ``cost`` for one map, one panel per footprint; hollow where only noise.
 
@@ -105,14 +104,9 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
         points = [point for point in unit["points"] if point[cost] > 0]
         front = pareto.front(points, cost, metric)
         on_front = {point["method"] for point in front}
-        axis.plot(
-            [scale * p[cost] for p in front],
-            np.minimum.accumulate([p[metric] for p in front]),
-            drawstyle="steps-post",
-            color="#c8c8c8",
-            linewidth=3,
-            zorder=1,
-        )
+        lowest = np.minimum.accumulate(column(front, metric))
+        step = {"drawstyle": "steps-post", "color": "#c8c8c8", "linewidth": 3, "zorder": 1}
+        axis.plot(scale * column(front, cost), lowest, **step)
         for sigma, floor in unit["noise_floor"].items():
             style = "--" if float(sigma) == 0 else ":"
             axis.axhline(floor[metric], linestyle=style, color="#777777", linewidth=0.9, zorder=1)
@@ -120,12 +114,8 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
             own = [p for p in points if p["family"] == family]
             if len(own) > 1 and all(p["rung"] is not None for p in own):
                 own.sort(key=lambda p: p["rung"])
-                axis.plot(
-                    [scale * p[cost] for p in own],
-                    [p[metric] for p in own],
-                    color=palette.colour[family],
-                    linewidth=0.8,
-                )
+                colour, at = palette.colour[family], scale * column(own, cost)
+                axis.plot(at, column(own, metric), color=colour, linewidth=0.8)
             for point in own:
                 (mark,) = axis.plot(
                     [scale * point[cost]],
@@ -160,8 +150,8 @@ def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> F
             own = [next(p for p in unit["points"] if p["method"] == method) for unit in units]
             family = own[0]["family"]
             (line,) = axis.plot(
-                [unit["radius"] for unit in units],
-                [1e6 * point["seconds_per_query"] for point in own],
+                column(units, "radius"),
+                1e6 * column(own, "seconds_per_query"),
                 marker=palette.marker[family],
                 markersize=3,
                 linewidth=0.9,
@@ -181,31 +171,16 @@ def images(name: str, points: list[dict], noise: float, names: list[str]) -> Fig
     figure, axes = panels(2, width=4.6, height=3.6)
     colours = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))
     for index, method in enumerate(names):
-        own = sorted(
-            (point for point in points if point["method"] == method),
-            key=lambda point: point["samples_per_pixel"],
-        )
+        own = [point for point in points if point["method"] == method]
+        own.sort(key=lambda point: point["samples_per_pixel"])
         for axis, x in zip(axes, ("seconds", "samples_per_pixel"), strict=True):
-            at = [point[x] for point in own]
-            colour = colours[index % 20]
-            axis.fill_between(
-                at,
-                [point["rmse_low"] for point in own],
-                [point["rmse_high"] for point in own],
-                color=colour,
-                alpha=0.2,
-                linewidth=0,
-            )
-            axis.plot(at, [p["rmse"] for p in own], color=colour, linewidth=1, label=method)
+            at, colour = column(own, x), colours[index % 20]
+            band = column(own, "rmse_low"), column(own, "rmse_high")
+            axis.fill_between(at, *band, color=colour, alpha=0.2, linewidth=0)
+            axis.plot(at, column(own, "rmse"), color=colour, linewidth=1, label=method)
             for point in own:
-                axis.plot(
-                    [point[x]],
-                    [point["rmse"]],
-                    MARKERS[index % len(MARKERS)],
-                    color=colour,
-                    markersize=4,
-                    gid=f"{name}-{x}--{point['id']}",
-                )
+                look = {"color": colour, "markersize": 4, "gid": f"{name}-{x}--{point['id']}"}
+                axis.plot([point[x]], [point["rmse"]], MARKERS[index % len(MARKERS)], **look)
     for axis, label in zip(axes, ("seconds of rendering", "samples per pixel"), strict=True):
         axis.axhline(noise, linestyle="--", color="#777777", linewidth=0.9)
         axis.set(xscale="log", yscale="log", xlabel=label)

@@ -9,9 +9,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.measures import images
+from benchmarks.report import figures, page, pareto
 from glintbsdf.scene.rendering import replacing
-
-from . import figures, images, page, pareto
 
 #: Of the JSON; ``schema.json`` describes it.
 SCHEMA_VERSION = 1
@@ -154,11 +154,8 @@ def write_csv(path: Path, rows: list[dict]) -> None:
 def fronts(rows: list[dict]) -> Table:
     """The front of error against time per map and footprint."""
     found = Table(title="What no other method beats in both time per query and relative L1 error")
-    found.add_column("map")
-    found.add_column("r (texels)", justify="right")
-    found.add_column("µs", justify="right")
-    found.add_column("error", justify="right")
-    found.add_column("method")
+    for name in ("map", "r (texels)", "µs", "error", "method"):
+        found.add_column(name, justify="left" if name in ("map", "method") else "right")
     for row in rows:
         for position, point in enumerate(row["front"]):
             where = ("", "") if position else (row["map"], f"{row['radius']:g}")

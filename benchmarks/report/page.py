@@ -16,11 +16,8 @@ from glintbsdf.check.plot import colour_map
 _GAMMA = 0.5
 
 
-def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str], picture) -> str:
-    """The page of a report.
-
-    ``drawn`` are SVG texts by the names that ``picture`` gives them, ``thumbnails`` data URIs.
-    """
+def fill(template: str, **values: object) -> str:
+    """A template of this folder with its values; what it lacks is an error."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -28,7 +25,16 @@ def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str], pictur
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    return environment.get_template("page.html.jinja").render(
+    return environment.get_template(template).render(**values)
+
+
+def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str], picture) -> str:
+    """The page of a report.
+
+    ``drawn`` are SVG texts by the names that ``picture`` gives them, ``thumbnails`` data URIs.
+    """
+    return fill(
+        "page.html.jinja",
         report=report,
         figures={name: jinja2.utils.markupsafe.Markup(svg) for name, svg in drawn.items()},
         thumbnails=thumbnails,

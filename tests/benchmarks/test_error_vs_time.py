@@ -17,15 +17,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 ROOT = Path(__file__).parents[2]
-BENCHMARKS = ROOT / "benchmarks"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _scripts():
-    """Let the benchmarks' modules be found, as where the scripts run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        yield
+SCHEMA = ROOT / "benchmarks" / "report" / "schema.json"
 
 
 # -------------------------------------------------------------------------------------------------
@@ -38,7 +30,7 @@ def point(method, seconds, l1, noise=0.001):
 
 
 def test_front_holds_what_nothing_beats():
-    from report import pareto
+    from benchmarks.report import pareto
 
     points = [
         point("slow and exact", 8.0, 0.0005),
@@ -52,7 +44,7 @@ def test_front_holds_what_nothing_beats():
 
 
 def test_errors_within_their_noise_are_none():
-    from report import pareto
+    from benchmarks.report import pareto
 
     points = [point("noisy", 1.0, 0.08, noise=0.07), point("sure", 2.0, 0.04)]
     assert pareto.front(points) == points[:1]
@@ -61,7 +53,7 @@ def test_errors_within_their_noise_are_none():
 
 
 def test_the_first_among_equally_fast_is_named():
-    from report import pareto
+    from benchmarks.report import pareto
 
     points = [point("simple", 1.2, 0.04), point("other", 1.0, 0.04), point("slow", 1.4, 0.04)]
     assert pareto.fastest(points, 0.05)["method"] == "simple"
@@ -70,7 +62,7 @@ def test_the_first_among_equally_fast_is_named():
 
 
 def test_equal_times_are_interpolated_as_powers_and_never_beyond():
-    from report import images
+    from benchmarks.measures import images
 
     def curve(method, first, last, factor):
         seconds = np.geomspace(first, last, 3)
@@ -90,7 +82,7 @@ def test_equal_times_are_interpolated_as_powers_and_never_beyond():
 
 
 def test_bands_cover_the_mean_as_often_as_they_say():
-    from report import images
+    from benchmarks.measures import images
 
     rng = np.random.default_rng(0)
     bands = [images.band(list(5 + rng.standard_normal(4))) for _ in range(2000)]
@@ -102,8 +94,8 @@ def test_bins_are_averaged_without_bias_and_with_the_error_they_have(variant):
     """A density whose mean over bins is known: both its error and its noise are those measured."""
     import drjit as dr
     import mitsuba as mi
-    from report import pndf
 
+    from benchmarks.measures import pndf
     from glintbsdf.check.reference import BinnedPNDF
     from glintbsdf.footprint.gaussian import Footprint
 
@@ -130,8 +122,7 @@ def test_bins_are_averaged_without_bias_and_with_the_error_they_have(variant):
 
 
 def test_noise_is_the_error_of_an_exact_density(variant):
-    from report import pndf
-
+    from benchmarks.measures import pndf
     from glintbsdf.check.reference import BinnedPNDF
 
     rng = np.random.default_rng(3)
@@ -154,7 +145,7 @@ def test_noise_is_the_error_of_an_exact_density(variant):
 
 
 def test_store_keeps_whole_units_only(tmp_path):
-    from report.store import Store
+    from benchmarks.harness import Store
 
     store, calls = Store(tmp_path, {"machine": 1}), []
 
@@ -182,22 +173,26 @@ def test_store_keeps_whole_units_only(tmp_path):
 # -------------------------------------------------------------------------------------------------
 
 #: The command, with a report that takes half a minute.
-SCRIPT = f"""
-import sys
-sys.path.insert(0, {str(BENCHMARKS)!r})
-import error_vs_time as script
+SCRIPT = """
+from benchmarks.__main__ import fresh_caches, run
 
-if __name__ == "__main__":
-    script.QUICK = script.Settings(
-        script.pndf.Settings(64, (2, 8), ((0.37, 0.61),), 16, 20_000, 2**17, 5.0, 2, 0.002),
-        script.images.Settings(64, ("flakes",), (2.0,), 16, 32, (1, 4), 2),
-        script.grid.Settings(2000, 1),
+def shorten():
+    from benchmarks.commands import error_vs_time as command
+    from benchmarks.measures import glitter, images, pndf
+    command.QUICK = command.Settings(
+        pndf.Settings(64, (2, 8), ((0.37, 0.61),), 16, 20_000, 2**17, 5.0, 2, 0.002),
+        images.Settings(64, ("flakes",), (2.0,), 16, 32, (1, 4), 2),
+        glitter.Settings(2000, 1),
     )
     names = ("manifold, exact", "filter, lean")
-    script.METHODS = [method for method in script.METHODS if method.name in names]
-    for method in script.METHODS:
+    command.METHODS = [method for method in command.METHODS if method.name in names]
+    for method in command.METHODS:
         object.__setattr__(method, "image", method.name == "filter, lean")
-    script.main()
+
+if __name__ == "__main__":
+    with fresh_caches():
+        shorten()
+        run()
 """
 
 
@@ -207,9 +202,11 @@ def folder(tmp_path_factory):
     base = tmp_path_factory.mktemp("report")
     script, output = base / "run.py", base / "report"
     script.write_text(SCRIPT, encoding="utf-8")
-    command = [sys.executable, str(script), "--quick", "--maps", "flakes", "-o", str(output)]
+    command = [sys.executable, str(script), "error_vs_time", "--quick", "--maps", "flakes"]
+    command += ["-o", str(output)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
 
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
         deadline = time.monotonic() + 120
         while not list(output.glob("measured/*.npz")) and process.poll() is None:
             assert time.monotonic() < deadline
@@ -222,7 +219,7 @@ def folder(tmp_path_factory):
     measured = {path: path.stat().st_mtime_ns for path in output.glob("measured/*")}
     assert measured and all(path.suffix == ".npz" for path in measured)
 
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
     assert done.returncode == 0, done.stderr
     assert "What no other method beats" in done.stdout
     assert all(path.stat().st_mtime_ns == then for path, then in measured.items())
@@ -236,7 +233,7 @@ def report(folder):
 
 def test_json_is_as_its_schema_says(report):
     jsonschema = pytest.importorskip("jsonschema")
-    schema = json.loads((BENCHMARKS / "report" / "schema.json").read_text(encoding="utf-8"))
+    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.Draft202012Validator(schema).validate(report)
 

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_separation import manifold, parts, room
 
 from glintbsdf.cli import entry as cli
 from glintbsdf.scene import denoising, rendering, units
+from tests.bridge.test_separation import manifold, parts, room
 
 needs_denoiser = pytest.mark.skipif(
     importlib.util.find_spec("mitsuba_oidn") is None,
@@ -119,18 +119,19 @@ def test_missing_denoiser(variant, monkeypatch):
 @needs_denoiser
 def test_sheet_of_the_parts(variant, tmp_path):
     """The script that shows what is denoised, with the scene made for it."""
-    spec = importlib.util.spec_from_file_location("separated", SCENES / "separated.py")
-    separated = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(separated)
+    spec = importlib.util.spec_from_file_location("sheets", SCENES / "sheets.py")
+    sheets = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sheets)
     size = {"resx": "30", "resy": "20"}
     scene = rendering.load_scene(SCENES / "interreflection.xml", size)
-    direct, indirect, filtered, whole = separated.pictures(scene, 4)
+    direct, indirect, filtered, whole = sheets.parts(scene, 4)
     assert np.all(np.array([direct.mean(), indirect.mean(), filtered.mean()]) > 0.01)
     assert np.allclose(direct + filtered, whole) and not np.allclose(indirect, filtered)
-    assert tuple(separated.sheet([direct, indirect, filtered, whole]).size()) == (60, 40)
+    assert tuple(sheets.two_by_two([direct, indirect, filtered, whole]).size()) == (60, 40)
 
-    with pytest.raises(SystemExit):
-        separated.main([str(SCENES / "kettle.xml"), "-o", str(tmp_path / "sheet.png")])
+    arguments = [str(SCENES / "kettle.xml"), "-o", str(tmp_path / "sheet.png")]
+    refused = CliRunner().invoke(sheets.sheets, ["separated", *arguments])
+    assert refused.exit_code == 2 and '"glint_path" with "separate" on' in refused.output
 
 
 @needs_denoiser

@@ -9,7 +9,8 @@ import shutil
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_scenes import SCENES, load, repeatability
+
+from tests.scenes.test_scenes import SCENES, load, repeatability
 
 # Scene, horizontal field of view, a window (fractions of rows and columns) that shows the material
 # alone, and parameters: maps so coarse that a small image resolves them, and next to no reliefs,

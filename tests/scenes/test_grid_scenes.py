@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import skimage.io
+from click.testing import CliRunner
 
 SCENES = Path(__file__).parents[2] / "scenes"
 # Scene, horizontal field of view, and a window (rows, columns) of a 60 × 60 image on the material
@@ -49,15 +50,17 @@ def test_glints(variant, name):
 
 
 def test_contact_sheet(variant, tmp_path):
-    spec = importlib.util.spec_from_file_location("animate", SCENES / "animate.py")
-    animate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(animate)
+    spec = importlib.util.spec_from_file_location("sheets", SCENES / "sheets.py")
+    sheets = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sheets)
     output = tmp_path / "sheet.png"
-    animate.main([str(SCENES / "dress.xml"), "-o", str(output), "-m", variant, "--frames", "7",
-                  "--spp", "1", "-D", "resx=24", "-D", "resy=16"])  # fmt: skip
+    options = ["-o", str(output), "-m", variant, "--frames", "7", "--spp", "1"]
+    options += ["-D", "resx=24", "-D", "resy=16"]
+    command = ["animate", str(SCENES / "dress.xml"), *options]
+    CliRunner().invoke(sheets.sheets, command, catch_exceptions=False)
     sheet = skimage.io.imread(output)
     assert sheet.shape == (2 * 16, 5 * 24, 3)
     first, second, missing = sheet[:16, :24], sheet[:16, 24:48], sheet[16:, 48:]
     assert (first != second).any() and missing.max() == 0
-    with pytest.raises(SystemExit):
-        animate.main([str(tmp_path / "missing.xml")])
+    missing = CliRunner().invoke(sheets.sheets, ["animate", str(tmp_path / "missing.xml")])
+    assert missing.exit_code == 2 and "does not exist" in missing.output

@@ -10,8 +10,11 @@ density D, and bins can be as small as the map's normals ask.
 
 from __future__ import annotations
 
+import os
 import re
+import tempfile
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -184,14 +187,61 @@ def p_value(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray)
 
 
 def assert_distributed(
-    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, test_count: int
+    counts: np.ndarray,
+    total: int,
+    mass: np.ndarray,
+    error: np.ndarray,
+    test_count: int,
+    bounds: Bounds | None = None,
 ) -> None:
     """The test of :func:`p_value`, as one of ``test_count``.
 
-    The significance of one is :data:`SIGNIFICANCE` after Šidák's correction for them all.
+    The significance of one is :data:`SIGNIFICANCE` after Šidák's correction for them all. A failure
+    names a file with the table of the test, see :func:`dumped`.
     """
     p = p_value(counts, total, mass, error)
-    assert p > 1 - (1 - SIGNIFICANCE) ** (1 / test_count), p
+    significance = 1 - (1 - SIGNIFICANCE) ** (1 / test_count)
+    if not p > significance:
+        table = dumped(counts, total, mass, error, bounds)
+        raise AssertionError(
+            f"p = {p:.3g} is below {significance:.3g}: {total} samples are not distributed as "
+            f"stated; observed and expected counts of all bins are in {table}"
+        )
+
+
+#: Environment variable that names the folder for tables of χ² tests that fail; it may not exist.
+TABLES = "GLINTBSDF_CHI2_TABLES"
+
+
+def dumped(
+    counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, bounds: Bounds | None
+) -> Path:
+    """Write the table of a χ² test, one line per bin, and return the file.
+
+    The columns: row and column of the bin; the position of its middle on the disk of projected
+    normals, where ``bounds`` are known; observed and expected counts; the standard deviation of
+    their difference, from sampling and from the quadrature; and the difference over it. The file is
+    a CSV in the folder that the environment variable :data:`TABLES` names, else in the system's
+    folder for temporary files.
+    """
+    rows, columns = np.indices(np.atleast_2d(counts).shape).reshape(2, -1)
+    position = np.full((2, counts.size), np.nan)
+    if bounds is not None:
+        lower, upper = np.array(bounds)
+        size = (upper - lower) / counts.shape[::-1]
+        position = (lower + size * (np.stack([columns, rows], axis=1) + 0.5)).T
+    observed, expected = counts.ravel(), total * mass.ravel()
+    deviation = np.sqrt(np.maximum(expected, 0) + (total * error.ravel()) ** 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pull = (observed - expected) / deviation
+    folder = Path(os.environ.get(TABLES) or tempfile.gettempdir())
+    folder.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix="glintbsdf-chi2-", suffix=".csv", dir=folder)
+    with os.fdopen(handle, "w") as file:
+        names = "row,column,x,y,observed,expected,deviation,pull"
+        table = np.stack([rows, columns, *position, observed, expected, deviation, pull], axis=1)
+        np.savetxt(file, table, fmt="%.9g", delimiter=",", header=names, comments="")
+    return Path(name)
 
 
 def check_chi2(
@@ -216,7 +266,7 @@ def check_chi2(
     assert lost <= 1e-4 * samples, f"{lost} samples are invalid or outside of the bounds"
 
     mass, error = mass_in_bins(bsdf, view, bounds, res)
-    assert_distributed(counts, samples, mass, error, test_count)
+    assert_distributed(counts, samples, mass, error, test_count, bounds)
     # 1e-4: float32 rounding, of the area of triangles above all.
     assert abs(mass.sum() - 1) <= 4 * np.sqrt((error**2).sum()) + 1e-4, mass.sum()
 
@@ -240,7 +290,7 @@ def check_against_reference(
     )
     counts = reference.density * reference.bin_area * samples
     mass, error = mass_in_bins(bsdf, view, reference.bounds, res)
-    assert_distributed(counts, samples, mass, error, test_count)
+    assert_distributed(counts, samples, mass, error, test_count, reference.bounds)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -106,6 +106,41 @@ def wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
     return index % count
 
 
+def slope_moments(
+    normal_map: NormalMap, uv: np.ndarray, axes: np.ndarray, k: int = 9
+) -> np.ndarray:
+    """Means, mean squares and mean products of slopes (N, 5: x, y, x², y², xy) of the map's mesh.
+
+    They are weighed by Gaussian footprints: ``uv`` (N, 2) are the places, ``axes`` (N, 2, 2) the
+    axes du, dv in columns, texels. The sums take k² points per texel, k an odd number,
+    out to 4 standard deviations. Where the slope goes from 0 to another value within a texel, as at
+    a scratch, k points find its mean square too small by 1/(4k²): 3 points would be wrong by 3 %.
+    """
+    fine, mode = refined(normal_map, k), normal_map.wrap_mode
+    height, width = k * normal_map.height, k * normal_map.width
+    result = []
+    for place, axis in zip(uv, axes, strict=True):
+        covariance = axis @ axis.T
+        extent = np.ceil(4 * np.sqrt(np.diag(covariance))).astype(int)
+        centre = np.asarray(place) * [normal_map.width, normal_map.height]  # in texels' edges
+        corner = np.floor(centre).astype(int) - extent
+        column, row = (
+            np.arange(k * c, k * (c + 2 * e + 1)) for c, e in zip(corner, extent, strict=True)
+        )
+        offset = np.stack(np.meshgrid(*((x + 0.5) / k for x in (column, row))), -1) - centre
+        inverse = np.linalg.inv(covariance)
+        weight = np.exp(-0.5 * np.einsum("...i,ij,...j", offset, inverse, offset))
+        if mode == "clamp":
+            # Beyond the border the border's texel goes on, from its centre.
+            row = np.clip(row, k // 2, height - 1 - k // 2)
+            column = np.clip(column, k // 2, width - 1 - k // 2)
+        taken = fine[np.ix_(wrapped(row, height, mode), wrapped(column, width, mode))]
+        taken = taken.astype(np.float64)
+        x, y = np.moveaxis(taken / np.sqrt(1 - (taken**2).sum(axis=2, keepdims=True)), 2, 0)
+        result.append([np.average(m, weights=weight) for m in (x, y, x * x, y * y, x * y)])
+    return np.array(result)
+
+
 @dataclass(frozen=True)
 class Truth:
     """A reference image and its error.

@@ -373,9 +373,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def _require_whole(written: Path, path: Path) -> None:
-    """Raise OSError unless an image file has arrived on the disk as a whole.
+    """Raise OSError unless a file has arrived on the disk as a whole.
 
-    OpenEXR's reader finds a missing part as well as a damaged one, Mitsuba's that of a PNG.
+    An image is read back: OpenEXR's reader finds a missing part as well as a damaged one, Mitsuba's
+    that of a PNG. Of any other file it is known only that it is not empty.
     """
     reason = "it is empty"
     try:
@@ -387,8 +388,10 @@ def _require_whole(written: Path, path: Path) -> None:
 
                 with OpenEXR.File(str(written), separate_channels=True) as image:
                     whole = all(len(channel.pixels) for channel in image.channels().values())
-            else:
+            elif written.suffix.lower() in FORMATS:
                 whole = np.asarray(mi.Bitmap(str(written))).size > 0
+            else:
+                whole = True
             if whole:
                 return
     except Exception as error:  # of a library, or of the system: the file is not whole

@@ -12,11 +12,11 @@ axis, as texture hardware does (Heckbert, "Fundamentals of Texture Mapping and I
 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping", SIGGRAPH
 1999).
 
-Accuracy (``benchmarks/filtered_accuracy.py``, 512² maps from isotropic to scratched): where the
-minor axis has a standard deviation of at least 1.2 texels, and a 16th of the major one, the slopes'
-first and second moments are those of the continuous map under the footprint to 0.6 % and 0.9 %,
-root mean square over random footprints, relative to the map's root mean square slope and to its
-square. Narrower footprints mix the texels themselves in, whose mean squares exceed those of the
+Accuracy (``python -m benchmarks accuracy moments``, 512² maps from isotropic to scratched): where
+the minor axis has a standard deviation of at least 1.2 texels, and a 16th of the major one, the
+slopes' first and second moments are those of the continuous map under the footprint to 0.6 % and
+0.9 %, root mean square over random footprints, relative to the map's root mean square slope and to
+its square. Narrower footprints mix the texels themselves in, whose mean squares exceed those of the
 interpolated normals: 1 to 9 % off at one texel, 2 to 42 % at half a texel. Levels of half a texel
 would mend that, for 2.9 times the memory.
 

@@ -465,8 +465,8 @@ class ClusteredManifold(Manifold):
     clusters with a residual e^l ≤ r_x r_y τ, see :func:`~.fit_clusters`.
     So τ is the mean squared distance (texels²) by which a cluster as large as the footprint's
     r_x × r_y may misplace a normal; smaller ones may do so more. It bounds no error of the P-NDF,
-    which grows with it: see ``benchmarks/clusters.py``. Footprints of a few texels are exact, and
-    so are maps smaller than 32 texels (512, where the map is clamped).
+    which grows with it: see ``python -m benchmarks error_vs_time``. Footprints of a few texels are
+    exact, and so are maps smaller than 32 texels (512, where the map is clamped).
 
     A cluster's triangle of an area below ε/2 on the disk, whatever its size in texels, is replaced
     as the map's own are: a flat part of the map keeps the size that its highlight has without

@@ -329,7 +329,7 @@ FEW_QUADS = 25
 
 #: Footprints that touch more quads than this see one quad of each square of 2×2, 4×4, … instead,
 #: at a place that differs from square to square, which bounds a footprint's cost. The error of P is
-#: about 0.001 for maps of roughness 0.15, and 0.005 for 0.6 (benchmarks/projected_area.py).
+#: about 0.001 for maps of roughness 0.15, and 0.005 for 0.6 (``benchmarks projected_area areas``).
 MANY_QUADS = 4096
 
 #: Order of the rule of Gauss by the map's longest chord between unit normals of one triangle: the
@@ -520,7 +520,7 @@ GOLDEN = (5**0.5 - 1) / 2
 
 #: Share by which masking raises Λ where it comes from points, which costs at most 1 % of a facet's
 #: light. Without, a furnace reflects up to 1.014 of what it receives on maps of grooves and flakes,
-#: whose degenerate triangles are missed; with it, 1.0015 (benchmarks/projected_area.py).
+#: whose degenerate triangles are missed; with it, 1.0015 (``python -m benchmarks projected_area``).
 MISSED = 0.04
 
 #: Ω of the GGX area (:func:`ggx_area`) over the variance of slopes which are uniformly distributed

@@ -55,8 +55,8 @@ class TabulatedManifold(Manifold):
             1/128 of the range of the map's normals, at least 1e-4. Within a bin normals are spread
             evenly: bins that lie otherwise differ by more. The error predicted stays below; the one
             measured, averaged over three places, is 0.63 to 0.96 of it on six kinds of maps, 0.45
-            to 0.95 for kernels with an edge, up to 1.2 at a single place (``benchmarks/tables.py
-            --errors``). Footprints so small that it would be larger are evaluated exactly.
+            to 0.95 for kernels with an edge, up to 1.2 at a single place (``python -m benchmarks
+            manifold tables``). Footprints so small that it would be larger are evaluated exactly.
         domain: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
     A map with ``wrap_mode`` ``clamp`` is always evaluated exactly, and so is one whose data carry

@@ -15,12 +15,11 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from _common import seconds_in_turn
 
+from benchmarks.harness import seconds_in_turn
+from benchmarks.measures.pndf import batch
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.pndf.grid.microdetails import Grid, beckmann, slope_jacobian
-
-from .pndf import batch
 
 #: Of the footprint: its axes are as 1 to this.
 STRETCH = 64.0

@@ -1,49 +1,45 @@
-"""The P-NDF level: error against the binned reference, time per query, memory, building."""
+"""Errors of P-NDFs against the binned reference, their noise, and the time of queries."""
 
 from __future__ import annotations
 
 import os
 import shutil
-import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import gamma
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from _common import seconds, seconds_in_turn
 
-from glintbsdf import NormalMap
-from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds, texel_covariance
-from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.pndf.manifold.mesh import TexelMesh
-
-from .methods import EXACT, SIGMA_R, Method, Surface
+from benchmarks.cases import Ellipse, Surface, queries
+from benchmarks.harness import seconds, seconds_in_turn, single_thread, timed
+from benchmarks.methods import EXACT, SIGMA_R, Method
+from glintbsdf import Footprint
+from glintbsdf.check import suite
+from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds
 
 #: Clamp of the Jacobian of those who have none: their own roughness hides it.
 UNCLAMPED = 1e-6
 
-#: Queries of a call that takes little more than to be traced.
-FEW = 64
-
-#: Most queries of a batch.
-MOST = 2**18
+#: Queries of a call that takes little more than to be traced, and most queries of a batch.
+FEW, MOST = 64, 2**18
 
 #: Seconds that a query takes at least: where queries take no longer than tracing does, noise may
 #: leave nothing of them.
 LEAST = 1e-9
 
-#: Independent sets of points, whose spread tells the noise of a bin's mean; and the mean of a
-#: sample standard deviation of so many Gaussian numbers over the true one.
-SETS, BIAS = 4, 0.9213
+#: Independent sets of points, whose spread tells the noise of a bin's mean.
+SETS = 4
 
 #: Most points of a set per bin and axis, if time allows.
-MOST_POINTS = 16
+MOST_POINTS = 24
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the P-NDF level is measured.
+    """How the P-NDF level of the report is measured.
 
     ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``points``
     the most at which a density is averaged over bins, in ``patience`` seconds, if they took as long
@@ -61,45 +57,25 @@ class Settings:
     batch: float
 
 
-def build(method: Method, surface: Surface):
-    """The estimator of a method. Without masking, which is no part of a P-NDF."""
-    parameters = {"masking": "none"}
-    if method.plugin["type"] == "glint_manifold":
-        parameters["epsilon"] = surface.epsilon
-    return mi.load_dict({**method.describe(surface), **parameters}).pndf
-
-
-def structure(method: Method, surface: Surface, with_compiling: bool):
+def structure(method: Method, surface: Surface, with_compiling: bool) -> tuple:
     """The estimator, and the seconds to build it, its memory, and the seconds to compile it.
 
     Nothing comes from the cache on disk. Compiling, of the code that builds and of that of the
     first query, is what takes longer the first time, with Dr.Jit's own cache emptied; None where
     it is not asked for, as it hardly depends on the map.
     """
-    m, footprint = queries(surface, 16.0, FEW)
+    m, footprint = queries(surface.normal_map, Ellipse.round(16 / 3), FEW, surface.epsilon)
     compiling = None
     if with_compiling:
         forget_kernels()
-        pndf, cold = timed(lambda: build(method, surface))
+        pndf, cold = timed(lambda: method.build(surface))
         cold += seconds(pndf.eval, m, footprint)
-    pndf, building = timed(lambda: build(method, surface))
+    pndf, building = timed(lambda: method.build(surface))
     if with_compiling:
         seconds(pndf.eval, m, footprint)
         compiling = max(cold - building - seconds(pndf.eval, m, footprint), 0.0)
-    return pndf, {
-        "build_seconds": building,
-        "compile_seconds": compiling,
-        "bytes": int(pndf.nbytes),
-    }
-
-
-def timed(action):
-    """What an action returns, and the seconds it took, all kernels done."""
-    dr.sync_thread()
-    start = time.perf_counter()
-    result = action()
-    dr.sync_thread()
-    return result, time.perf_counter() - start
+    figures = {"build_seconds": building, "compile_seconds": compiling, "bytes": int(pndf.nbytes)}
+    return pndf, figures
 
 
 def forget_kernels() -> None:
@@ -110,44 +86,19 @@ def forget_kernels() -> None:
     os.makedirs(folder)
 
 
-def texel_footprint(normal_map: NormalMap, uv: np.ndarray, sigma: float) -> Footprint:
-    """Round footprints of ``sigma`` texels at ``uv``, 2×N: as many lanes as places."""
-    u, v = (dr.opaque(mi.Float, sigma / n) for n in (normal_map.width, normal_map.height))
-    centre = mi.Point2f(*(mi.Float(np.float32(x)) for x in uv))
-    return Footprint(centre, mi.Vector2f(u, 0), mi.Vector2f(0, v))
-
-
-def queries(surface: Surface, radius: float, count: int):
-    """Random places on the map, each with a normal drawn from its own exact P-NDF.
-
-    So a BSDF's samples ask; light sampling asks for other normals too, where D is often 0.
-    """
-    uv, u = np.random.default_rng(7).random((2, 2, count), dtype=np.float32)
-    footprint = texel_footprint(surface.normal_map, uv, radius / 3)
-    mesh = TexelMesh(surface.normal_map, epsilon=surface.epsilon)
-    kernel = mesh.texel_kernel(footprint)
-    m = mesh.normal_at(kernel.mean + kernel.sample(mi.Point2f(u)))
-    dr.eval(m, footprint.uv)
-    return m, footprint
-
-
-def first(count: int, m, footprint):
-    """The first of many queries."""
-    index = dr.arange(mi.UInt32, count)
-    part = type(footprint)(dr.gather(mi.Point2f, footprint.uv, index), footprint.du, footprint.dv)
-    m = dr.gather(mi.Vector2f, m, index)
-    dr.eval(m, part.uv)
-    return m, part
-
-
-# ------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 #  One footprint size of one map: all methods
-# ------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def measure(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
-    """A unit of the store: errors and times of all methods under footprints of one size."""
-    per_query, ratios = times(structures, surface, radius, settings)
+    """A unit of the report: errors and times of all methods under footprints of one size."""
+    ellipse = Ellipse.round(radius / 3)
+    many = queries(surface.normal_map, ellipse, MOST, surface.epsilon)
+    taken, ratios = times(structures.values(), many, settings.repetitions, settings.batch)
+    per_query = dict(zip(structures, taken.tolist(), strict=True))
+    if EXACT not in structures:
+        ratios = [None] * len(ratios)
     # One grid of bins for all, as wide as the roughest needs.
     rough = any(roughness(pndf) > 0 for pndf in structures.values())
     bounds = normal_bounds(surface.normal_map, surface.epsilon, SIGMA_R if rough else 0.0)
@@ -163,7 +114,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                 references[sigma_r] = binned_pndf(
                     surface.normal_map,
                     place,
-                    texel_covariance(surface.normal_map, radius / 3),
+                    ellipse.covariance(surface.normal_map),
                     epsilon=surface.epsilon if sigma_r == 0 else UNCLAMPED,
                     sigma_r=sigma_r,
                     res=settings.res,
@@ -174,7 +125,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                 pictures.setdefault(
                     f"reference {sigma_r:g}", references[sigma_r].density.astype(np.float32)
                 )
-            footprint = texel_footprint(surface.normal_map, np.array(place)[:, None], radius / 3)
+            footprint = ellipse.at(surface.normal_map, np.array(place)[:, None])
             affordable = min(settings.patience / per_query[method], settings.points)
             density, deviation = in_bins(pndf, footprint, references[sigma_r], affordable)
             pictures.setdefault(method.name, density.astype(np.float32))
@@ -195,10 +146,10 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
                 "sigma_r": roughness(pndf),
                 "bytes": int(pndf.nbytes),
                 "seconds_per_query": per_query[method],
-                "times_faster_than_exact": ratios[method],
+                "times_faster_than_exact": ratio,
                 **mean_of(results[method]),
             }
-            for method, pndf in structures.items()
+            for (method, pndf), ratio in zip(structures.items(), ratios, strict=True)
         ],
     }, pictures
 
@@ -211,11 +162,18 @@ def roughness(pndf) -> float:
     return round(float(np.ravel(getattr(pndf, "sigma_r", 0.0))[0]), 9)
 
 
-def in_bins(pndf, footprint: Footprint, reference: BinnedPNDF, affordable: float):
+def in_bins(
+    pndf,
+    footprint: Footprint,
+    reference: BinnedPNDF,
+    affordable: float,
+    sets: int = SETS,
+    empty: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean of D over every bin of the reference, and its standard error, by jittered points.
 
     Bins in which the reference has found something share about ``affordable`` points; the others,
-    which are empty or nearly so, have one in each of the sets.
+    which are empty or nearly so, have ``empty``² in each of the ``sets``.
     """
     lower, upper = np.array(reference.bounds)
     size = (upper - lower) / reference.density.shape[::-1]
@@ -234,13 +192,30 @@ def in_bins(pndf, footprint: Footprint, reference: BinnedPNDF, affordable: float
         return density.reshape(len(row), n * n).mean(axis=1, dtype=np.float64)
 
     found = reference.density > 0
-    points = int(np.clip(np.sqrt(affordable / (SETS * found.sum())), 1, MOST_POINTS))
+    points = int(np.clip(np.sqrt(affordable / (sets * found.sum())), 1, MOST_POINTS))
     mean, deviation = np.zeros((2, *found.shape))
-    for bins, n in ((found, points), (~found, 1)):
-        sets = [means(bins, n) for _ in range(SETS)]
-        mean[bins] = np.mean(sets, axis=0)
-        deviation[bins] = np.std(sets, axis=0, ddof=1) / (BIAS * SETS**0.5)
+    for bins, n in ((found, points), (~found, empty)):
+        found_means = [means(bins, n) for _ in range(sets)]
+        mean[bins] = np.mean(found_means, axis=0)
+        deviation[bins] = np.std(found_means, axis=0, ddof=1) / (bias(sets) * sets**0.5)
     return mean, deviation
+
+
+def bias(count: int) -> float:
+    """Mean of the sample standard deviation of ``count`` Gaussian numbers, over the true one."""
+    return (2 / (count - 1)) ** 0.5 * gamma(count / 2) / gamma((count - 1) / 2)
+
+
+def p_value(
+    reference: BinnedPNDF, density: np.ndarray, deviation: np.ndarray, samples: int, sets: int
+) -> float:
+    """Of Pearson's χ² test of the reference's ``samples`` against a density from ``sets`` sets."""
+    area = reference.bin_area
+    # A variance estimated from n sets makes the square of a t-distribution, of this mean.
+    deviation = deviation * bias(sets) * ((sets - 1) / (sets - 3)) ** 0.5
+    return suite.p_value(
+        samples * area * reference.density, samples, area * density, area * deviation
+    )
 
 
 def errors(reference: BinnedPNDF, density: np.ndarray) -> dict[str, float]:
@@ -273,52 +248,56 @@ def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def times(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
-    """Median seconds per query of every method, and how many times faster than exact it is.
+# --------------------------------------------------------------------------------------------------
+#  Times
+# --------------------------------------------------------------------------------------------------
 
-    One thread. All methods in turn within every repetition, after a warm-up that compiles and finds
-    how many queries make a batch. The time of a call with few queries, which is that of tracing, is
-    taken off.
+
+def times(
+    pndfs: Sequence, many: tuple, repetitions: int, batch_seconds: float = 0.05
+) -> tuple[np.ndarray, list[float]]:
+    """Median seconds per query of every P-NDF, and how many times faster than the first it is.
+
+    One thread. All run in turn within every repetition, after a warm-up that compiles and finds how
+    many of the ``many`` queries make a batch. The time of a call with few queries, which is that of
+    tracing, is taken off.
     """
-    many = queries(surface, radius, MOST)
     few = first(FEW, *many)
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
+    with single_thread():
         works, counts = [], []
-        for pndf in structures.values():
-            counts.append(batch_size(pndf, many, settings.batch))
+        for pndf in pndfs:
+            counts.append(batch_size(pndf, many, batch_seconds))
             works.append(partial(batch, pndf, *few))
             works.append(partial(batch, pndf, *first(counts[-1], *many)))
-        taken = seconds_in_turn(works, settings.repetitions)
-        taken = (taken[:, 1::2] - taken[:, ::2]) / (np.array(counts) - FEW)
-        taken = np.maximum(taken, LEAST)
-    finally:
-        dr.set_thread_count(threads)
-    per_query = np.median(taken, axis=0)
-    names = [method.name for method in structures]
-    ratios = [None] * len(names)
-    if EXACT.name in names:
-        exact = taken[:, [names.index(EXACT.name)]]
-        ratios = np.median(exact / taken, axis=0).tolist()
-    return dict(zip(structures, per_query.tolist(), strict=True)), dict(
-        zip(structures, ratios, strict=True)
-    )
+        taken = seconds_in_turn(works, repetitions)
+    taken = (taken[:, 1::2] - taken[:, ::2]) / (np.array(counts) - FEW)
+    taken = np.maximum(taken, LEAST)
+    return np.median(taken, axis=0), np.median(taken[:, :1] / taken, axis=0).tolist()
 
 
-def batch_size(pndf, many, wanted: float) -> int:
+def first(count: int, m: mi.Vector2f, footprint: Footprint) -> tuple:
+    """The first of many queries."""
+    index = dr.arange(mi.UInt32, count)
+    part = type(footprint)(dr.gather(mi.Point2f, footprint.uv, index), footprint.du, footprint.dv)
+    m = dr.gather(mi.Vector2f, m, index)
+    dr.eval(m, part.uv)
+    return m, part
+
+
+def batch_size(pndf, many: tuple, wanted: float) -> int:
     """How many of many queries take about ``wanted`` seconds besides tracing, from 2 ``FEW`` on."""
+    most = dr.width(many[0])
     traced = min(seconds(pndf.eval, *first(FEW, *many)) for _ in range(3))  # the first one compiles
     count = FEW
     while True:
-        count *= 4
+        count = min(4 * count, most)
         taken = seconds(pndf.eval, *first(count, *many)) - traced
-        if taken > 0.25 * wanted or count == MOST:
+        if taken > 0.25 * wanted or count == most:
             break
     size = wanted / max(taken, LEAST) * count
-    return int(np.clip(size, 2 * FEW, MOST)) // 8 * 8
+    return int(np.clip(size, 2 * FEW, most)) // 8 * 8
 
 
-def batch(pndf, m, footprint, repetition: int) -> mi.Float:
+def batch(pndf, m: mi.Vector2f, footprint: Footprint, repetition: int) -> mi.Float:
     """The same queries in every repetition."""
     return pndf.eval(m, footprint)

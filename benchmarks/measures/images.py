@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.stats
-from curved_patch import curved_patch
 
+from benchmarks.cases import Surface, curved_patch, scaled
+from benchmarks.harness import ratios_to_first, seconds, seconds_in_turn, timed
+from benchmarks.methods import BASELINES, Method
 from glintbsdf.check.truth import Truth, reference_render
 from glintbsdf.scene.rendering import pixel_angle
-
-from .methods import BASELINES, Method, Surface
-from .pndf import timed
 
 #: Radius of the lights: brute force finds the scene's own too seldom.
 LIGHT_RADIUS = 0.07
@@ -107,37 +108,28 @@ def serve(connection, variant: str, *arguments: object) -> None:
 
 def load(material: Method | str, surface: Surface, scale: float, settings: Settings) -> mi.Scene:
     """The scene with a material: a method, or the name of a baseline."""
-    shared = {"material": "Cr", "to_uv": mi.ScalarTransform4f().scale([scale, scale, 1])}
+    shared = {"material": "Cr", "to_uv": scaled(scale)}
     if isinstance(material, str):
         described = BASELINES[material](surface.normal_map, **shared)
     else:
         described = material.describe(surface) | shared | {"footprint_sigma": FOOTPRINT_SIGMA}
-    scene = curved_patch(described, settings.size, 1, LIGHT_RADIUS)
-    parameters = mi.traverse(scene)
-    parameters.keep([r".*x_fov$"])
-    (key,) = parameters.keys()
-    parameters[key] = FIELD_OF_VIEW
-    parameters.update()
-    return scene
+    return curved_patch(described, settings.size, 1, LIGHT_RADIUS, FIELD_OF_VIEW)
 
 
-def renderers(methods: list[Method], surface: Surface, scale: float, settings: Settings):
-    """A :class:`Renderer` per material, by name, made one after the other."""
+@contextmanager
+def renderers(
+    methods: list[Method], surface: Surface, scale: float, settings: Settings
+) -> Iterator[dict[str, Renderer]]:
+    """A :class:`Renderer` per material, by name, made one after the other; ends their processes."""
     materials = {name: name for name in BASELINES} | {method.name: method for method in methods}
     made: dict[str, Renderer] = {}
     try:
         for name, material in materials.items():
             made[name] = Renderer(mi.variant(), material, surface, scale, settings)
-    except BaseException:
-        close(made)
-        raise
-    return made
-
-
-def close(made: dict[str, Renderer]) -> None:
-    """End the processes of renderers."""
-    for renderer in made.values():
-        renderer.close()
+        yield made
+    finally:
+        for renderer in made.values():
+            renderer.close()
 
 
 def truth(surface: Surface, scale: float, settings: Settings):
@@ -157,12 +149,7 @@ def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
         parameters[key] = dr.opaque(mi.Float, pixel_angle(scene.sensors()[0]) / spp**0.5)
     parameters.update()
 
-    def rendered() -> mi.TensorXf:
-        image = mi.render(scene, spp=spp, seed=seed)
-        dr.eval(image)
-        return image
-
-    image, taken = timed(rendered)
+    image, taken = timed(lambda: mi.render(scene, spp=spp, seed=seed))
     return np.array(image)[..., :3].astype(np.float64), taken
 
 
@@ -174,9 +161,9 @@ def measure(made: dict[str, Renderer], reference: Truth, spp: int, settings: Set
         renderer.render(spp, 0)  # warms up
     for seed in range(1, settings.seeds + 1):
         for name, renderer in made.items():
-            image, seconds = renderer.render(spp, seed)
+            image, time = renderer.render(spp, seed)
             images.setdefault(name, image.astype(np.float32))
-            taken[name].append(seconds)
+            taken[name].append(time)
             error[name].append(reference.relative_rmse(image))
             mean[name].append(float(image.mean() / reference.image.mean()))
     points = [
@@ -192,6 +179,23 @@ def measure(made: dict[str, Renderer], reference: Truth, spp: int, settings: Set
         for name, renderer in made.items()
     ]
     return {"points": points}, images
+
+
+def in_turn(scenes: tuple[mi.Scene, mi.Scene], spp: int, repetitions: int) -> dict:
+    """Times of frames of two scenes in turn, the first of which is a baseline.
+
+    The first frame of each compiles, and is timed apart.
+    """
+    frames = [lambda seed, scene=scene: mi.render(scene, spp=spp, seed=seed) for scene in scenes]
+    first = [seconds(frame, 0) for frame in frames]
+    times = seconds_in_turn(frames, repetitions)
+    median = np.median(times, axis=0)
+    return {
+        "ratio": float(ratios_to_first(times)[1]),
+        "seconds": float(median[1]),
+        "seconds_baseline": float(median[0]),
+        "first_frame": first[1],
+    }
 
 
 def band(errors: list[float]) -> dict[str, float]:
@@ -214,11 +218,11 @@ def at_equal_times(points: list[dict], count: int = 5) -> list[dict]:
     low = float(np.median([curve[0][0] for curve in arrays.values()]))
     high = float(np.median([curve[0][-1] for curve in arrays.values()]))
     rows = []
-    for seconds in np.geomspace(low, high, count):
+    for taken in np.geomspace(low, high, count):
         error = {
-            name: float(np.exp(np.interp(np.log(seconds), np.log(t), np.log(e))))
+            name: float(np.exp(np.interp(np.log(taken), np.log(t), np.log(e))))
             for name, (t, e) in arrays.items()
-            if t[0] <= seconds <= t[-1] and (e > 0).all()
+            if t[0] <= taken <= t[-1] and (e > 0).all()
         }
-        rows.append({"seconds": float(seconds), "rmse": error})
+        rows.append({"seconds": float(taken), "rmse": error})
     return rows

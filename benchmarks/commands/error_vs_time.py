@@ -1,7 +1,5 @@
 """Error against run time of every method: P-NDFs and images, at a ladder of settings.
 
-``python benchmarks/error_vs_time.py [--quick] -o DIR [--map FILE]…``
-
 *P-NDF level*: six procedural maps and any map given, round footprints of radius r = 3σ from 1 to
 512 texels. Relative L1, L2 and maximum error against the binned reference, whose own noise is
 measured too, against time per query (random places, normals drawn from the P-NDF, one thread) and
@@ -10,56 +8,33 @@ that is as rough. *Image level*: the curved patch against brute force at log-spa
 samples, several seeds; footprints shrink with the number of samples, as ``glintbsdf render`` has
 it. All methods run in turn within every repetition; building and compiling are timed apart.
 
-Expected before measuring: exact at the noise of the reference; tables within their ``max_error``
-and far ahead in time from 64 texels on; elements at a few per cent, falling with their step; lobes
-at 10 to 20 %; filters a hundred times faster, and wrong but for large footprints on Gaussian bumps.
-In images, brute force needs several times the samples of the glints' methods at small budgets and
-catches up at large ones, and ``roughconductor`` stops converging.
-
-DIR gets ``report.html``, one page with everything in it; ``report.json`` (see
+The folder gets ``report.html``, one page with everything in it; ``report.json`` (see
 ``benchmarks/report/schema.json``), ``pndf.csv``, ``images.csv`` and ``which_when.csv``, the fastest
 method per map, footprint and error; and ``figures``. The fronts of error against time are printed.
-What has been measured is kept in ``DIR/measured``: after Ctrl-C the same command goes on where it
-stopped. Other settings, another machine or a change of the package's source measure anew. Needs the
-``docs`` extra (matplotlib, Jinja2).
+The command needs the ``docs`` extra (matplotlib, Jinja2).
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
-import tempfile
 import time
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
-os.environ["GLINTBSDF_CACHE"] = "off"  # building is timed
-_kernels = tempfile.TemporaryDirectory()
-os.environ["DRJIT_CACHE_DIR"] = _kernels.name  # and so is compiling
+import click
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
 
-import glintbsdf  # noqa: E402, F401  (the environment comes first)
-
-import drjit as dr  # isort: skip # noqa: E402
-import mitsuba as mi  # isort: skip # noqa: E402
-
-mi.set_variant("llvm_ad_rgb")
-
-from glintbsdf.cli.main import interruptible  # noqa: E402
-from report import grid, images, output, pndf  # noqa: E402
-from report.methods import BASELINES, CASES, METHODS, Case, Method, given  # noqa: E402
-from report.store import Store, machine  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import (  # noqa: E402
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-)
-
-from glintbsdf.check.truth import Truth  # noqa: E402
+from benchmarks.cases import CASES, Case, given
+from benchmarks.harness import VARIANT, Store, machine, open_store, output_option
+from benchmarks.measures import glitter, images, pndf
+from benchmarks.methods import BASELINES, METHODS, Method
+from benchmarks.report import output as files
+from glintbsdf.check.truth import Truth
 
 
 @dataclass(frozen=True)
@@ -68,56 +43,32 @@ class Settings:
 
     pndf: pndf.Settings
     images: images.Settings
-    grid: grid.Settings
+    grid: glitter.Settings
 
 
 QUICK = Settings(
     pndf.Settings(
-        size=512,
-        radii=(2, 16, 128),
-        places=((0.37, 0.61),),
-        res=64,
-        samples=1_000_000,
-        points=2**17,
-        patience=4.0,
-        repetitions=3,
-        batch=0.02,
+        size=512, radii=(2, 16, 128), places=((0.37, 0.61),), res=64, samples=1_000_000,
+        points=2**17, patience=4.0, repetitions=3, batch=0.02,
     ),
     images.Settings(
-        map_size=512,
-        maps=("isotropic patches",),
-        scales=(2.0,),
-        size=64,
-        truth_spp=8192,
-        budgets=(1, 4, 16, 64, 256),
-        seeds=3,
+        map_size=512, maps=("isotropic patches",), scales=(2.0,), size=64, truth_spp=8192,
+        budgets=(1, 4, 16, 64, 256), seeds=3,
     ),
-    grid.Settings(places=100_000, repetitions=3),
-)
+    glitter.Settings(places=100_000, repetitions=3),
+)  # fmt: skip
 
 FULL = Settings(
-    pndf.Settings(
-        size=1024,
-        radii=(1, 4, 16, 64, 256, 512),
-        places=((0.37, 0.61),),
-        res=64,
-        samples=5_000_000,
-        points=2**19,
-        patience=8.0,
-        repetitions=5,
-        batch=0.05,
+    replace(
+        QUICK.pndf, size=1024, radii=(1, 4, 16, 64, 256, 512), samples=5_000_000, points=2**19,
+        patience=8.0, repetitions=5, batch=0.05,
     ),
-    images.Settings(
-        map_size=1024,
-        maps=("scratched", "isotropic patches"),
-        scales=(2.0, 8.0),
-        size=96,
-        truth_spp=16384,
-        budgets=(1, 4, 16, 64, 256),
-        seeds=5,
+    replace(
+        QUICK.images, map_size=1024, maps=("scratched", "isotropic patches"), scales=(2.0, 8.0),
+        size=96, truth_spp=16384, seeds=5,
     ),
-    grid.Settings(places=1_000_000, repetitions=5),
-)
+    glitter.Settings(places=1_000_000, repetitions=5),
+)  # fmt: skip
 
 
 class Measurement:
@@ -144,10 +95,10 @@ class Measurement:
             for scale in s.images.scales:
                 self.image_case(case, scale, found)
         key = {"unit": "grid", "settings": asdict(s.grid)}
-        found["grid"] = [self.unit("glint_grid", key, lambda: grid.measure(s.grid))]
+        found["grid"] = [self.unit("glint_grid", key, lambda: glitter.measure(s.grid))]
         return found
 
-    def unit(self, label: str, key: dict, measure):
+    def unit(self, label: str, key: dict, measure: Callable[[], tuple]) -> tuple:
         """A unit from the store; ``measure`` is called where it has none."""
         self.progress.update(self.task, description=label)
         start = time.perf_counter()
@@ -172,7 +123,7 @@ class Measurement:
         def footprint(radius: float):
             for method in methods:
                 if method not in built:  # an earlier run has timed it
-                    built[method] = pndf.build(method, surface)
+                    built[method] = method.build(surface)
             return pndf.measure({m: built[m] for m in methods}, surface, radius, settings)
 
         for method in methods:
@@ -212,14 +163,14 @@ class Measurement:
         )
         found["truths"].append(({**where, **values}, arrays))
         reference = Truth(arrays["image"], arrays["standard_error"])
-        made: dict[str, images.Renderer] = {}
+        with ExitStack() as stack:
+            made = cache(
+                lambda: stack.enter_context(images.renderers(methods, surface, scale, settings))
+            )
 
-        def budget(spp: int):
-            if not made:
-                made.update(images.renderers(methods, surface, scale, settings))
-            return images.measure(made, reference, spp, settings)
+            def budget(spp: int) -> tuple:
+                return images.measure(made(), reference, spp, settings)
 
-        try:
             for spp in settings.budgets:
                 key = {
                     "unit": "images",
@@ -230,64 +181,67 @@ class Measurement:
                 label = f"{case.name}: images of {spp} samples per pixel"
                 values, arrays = self.unit(label, key, partial(budget, spp))
                 found["images"].append(({**where, "samples_per_pixel": spp, **values}, arrays))
-        finally:
-            images.close(made)
 
 
-def report(
+def measure_all(
     settings: Settings, cases: list[Case], methods: list[Method], folder: Path, profile: str
 ) -> dict:
     """Measure what is not measured yet, and write the report to ``folder``; returns its JSON."""
     # Mitsuba never returns from reading an image where Dr.Jit has a single thread.
     dr.set_thread_count(max(2, dr.thread_count()))
-    here = machine()
-    store = Store(folder / "measured", {key: here[key] for key in here if key != "commit"})
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
+    store, console = open_store(folder), Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=console) as progress:
         found = Measurement(settings, cases, methods, store).run(progress)
     described = {
         "profile": profile,
         "settings": asdict(settings),
         "maps": [case.name for case in cases],
-        "methods": [asdict(method) | {"name": method.name} for method in methods],
+        "methods": [
+            {key: getattr(method, key) for key in ("name", "family", "setting", "plugin", "rung")}
+            for method in methods
+        ],
         "baselines": list(BASELINES),
     }
-    return output.write(folder, here, described, found, console)
+    return files.write(folder, machine(), described, found, console)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="in five minutes: fewer of everything")
-    parser.add_argument("--map", type=Path, action="append", default=[], help="a further map")
-    parser.add_argument("--maps", nargs="+", choices=[case.name for case in CASES],
-                        help="procedural maps; default: all")  # fmt: skip
-    families = list(dict.fromkeys(method.family for method in METHODS))
-    parser.add_argument("--families", nargs="+", choices=families, help="methods; default: all")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder to write to")
-    options = parser.parse_args()
-
-    settings = QUICK if options.quick else FULL
-    cases = [case for case in CASES if options.maps is None or case.name in options.maps]
-    cases += [given(path) for path in options.map]
-    methods = [
+def compared(quick: bool, families: tuple[str, ...]) -> list[Method]:
+    """The methods of the report, those of ``families`` if any are named."""
+    return [
         method
         for method in METHODS
-        if (method.quick or not options.quick)
-        and (options.families is None or method.family in options.families)
+        if (method.pndf or method.image)
+        and (method.quick or not quick)
+        and (not families or method.family in families)
     ]
-    options.output.mkdir(parents=True, exist_ok=True)
-    try:
-        with interruptible():
-            report(settings, cases, methods, options.output, "quick" if options.quick else "full")
-    except KeyboardInterrupt:
-        sys.exit("Interrupted. The same command goes on from here.")
 
 
-if __name__ == "__main__":
-    main()
+FAMILIES = list(dict.fromkeys(m.family for m in METHODS if m.pndf or m.image))
+
+
+@click.command(help=__doc__, short_help=__doc__.splitlines()[0])
+@click.option("--quick", is_flag=True, help="In five minutes: fewer of everything.")
+@click.option("--map", "others", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
+              help="A further map.")  # fmt: skip
+@click.option("--maps", multiple=True, type=click.Choice([case.name for case in CASES]),
+              help="Procedural maps; default: all.")  # fmt: skip
+@click.option("--families", multiple=True, type=click.Choice(FAMILIES),
+              help="Families of methods; default: all.")  # fmt: skip
+def error_vs_time(
+    quick: bool,
+    others: tuple[Path, ...],
+    maps: tuple[str, ...],
+    families: tuple[str, ...],
+    output: Path,
+    variant: str,
+) -> None:
+    mi.set_variant(variant)
+    cases = [case for case in CASES if not maps or case.name in maps]
+    cases += [given(path) for path in others]
+    output.mkdir(parents=True, exist_ok=True)
+    profile, settings = ("quick", QUICK) if quick else ("full", FULL)
+    measure_all(settings, cases, compared(quick, families), output, profile)
+
+
+error_vs_time.params += [output_option(required=True), VARIANT]

@@ -1,0 +1,78 @@
+"""``python -m benchmarks NAME``: one group of commands, each imported when it is asked for."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import NoReturn
+
+import click
+
+#: Modules of ``benchmarks.commands``; each has a command of its own name.
+COMMANDS = (
+    "error_vs_time",
+    "stability",
+    "accuracy",
+    "cost",
+    "manifold",
+    "projected_area",
+    "mip",
+    "grid",
+    "separation",
+)
+
+
+class Benchmarks(click.Group):
+    """The group of all :data:`COMMANDS`."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        return getattr(import_module(f"benchmarks.commands.{name}"), name)
+
+
+@click.group(cls=Benchmarks, context_settings={"help_option_names": ["-h", "--help"]})
+def benchmarks() -> None:
+    """Measure glintbsdf. Each command prints tables, and says first what was expected.
+
+    With -o, results go to a folder as JSON, pictures too, and a command that was interrupted goes
+    on where it stopped. Nothing comes from a cache on disk: building and compiling are timed.
+    """
+
+
+@contextmanager
+def fresh_caches() -> Iterator[None]:
+    """Let nothing come from a cache on disk that an earlier process has written.
+
+    Dr.Jit and glintbsdf read the environment when they are imported, which must come later.
+    """
+    with tempfile.TemporaryDirectory() as kernels:
+        os.environ |= {"GLINTBSDF_CACHE": "off", "DRJIT_CACHE_DIR": kernels}
+        yield
+
+
+def run() -> NoReturn:
+    """Run the command line. The exit status is 1 where it was interrupted."""
+    from glintbsdf.cli.entry import interruptible
+
+    try:
+        with interruptible():
+            status = benchmarks.main(prog_name="python -m benchmarks", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit("Interrupted. With -o, the same command goes on from here.")
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+if __name__ == "__main__":
+    with fresh_caches():
+        run()

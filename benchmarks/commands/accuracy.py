@@ -1,0 +1,169 @@
+"""Errors of P-NDFs and of moments, where those of error_vs_time do not suffice.
+
+Every part states the noise of the reference beside the error: the relative L1 difference that an
+exact density would show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.cases import PLACES, Ellipse, grid_of_normals, maps_of
+from benchmarks.harness import Run, family
+from benchmarks.measures import pndf as errors
+from glintbsdf import Footprint, NormalMap
+from glintbsdf.check.reference import binned_pndf
+from glintbsdf.check.truth import slope_moments
+from glintbsdf.footprint.kernels import KERNELS
+from glintbsdf.pndf import Filtered, Manifold
+
+# --------------------------------------------------------------------------------------------------
+#  Exactness
+# --------------------------------------------------------------------------------------------------
+
+#: Clamp of the Jacobian: the bins must resolve the clamped triangles.
+EPSILON = 1e-3
+
+ELLIPSES = (
+    *(Ellipse.round(sigma) for sigma in (0.5, 2, 20, 200)),
+    Ellipse(4, 0.5, 30),
+    Ellipse(60, 2),
+    Ellipse(60, 2, 115),
+    Ellipse(200, 3, 63),
+)
+SETS = 16
+
+
+def exactness(
+    build: Callable[[], Manifold], make: Callable[[], NormalMap], kernel: str, ellipse: Ellipse
+) -> dict:
+    """Error of the exact P-NDF, what noise alone makes, and the p-value of Pearson's χ² test."""
+    manifold, normal_map = build(), make()
+    area, samples = ellipse.major * ellipse.minor, 1_000_000
+    # Points enough for the spikes of small footprints, in a minute at most.
+    res, points = (32, 24) if area <= 20 else (32, 8) if area <= 1000 else (16, 4)
+    options = {"kernel": kernel, "epsilon": EPSILON, "res": res, "samples": samples, "seed": 1}
+    reference = binned_pndf(normal_map, PLACES[0], ellipse.covariance(normal_map), **options)
+    footprint = ellipse.at(normal_map, np.array(PLACES[0])[:, None])
+    density, deviation = errors.in_bins(
+        manifold, footprint, reference, SETS * res**2 * points**2, SETS, points
+    )
+    return {
+        "relative_l1": reference.relative_l1(density),
+        "noise": errors.noise(reference, deviation)["l1"],
+        "p_value": errors.p_value(reference, density, deviation, samples, SETS),
+    }
+
+
+def exact(run: Run) -> None:
+    """The exact manifold P-NDF on every procedural map, with all kernels.
+
+    Footprints go from 0.5 to 200 texels, round and stretched, along the axes and rotated. Both
+    sides have noise: the reference that of its counts, the density that of its average over a bin,
+    whose error is measured. Expected: p-values uniform in [0, 1]; the smallest of
+    n is about 1/n.
+    """
+    names = ("isotropic", "brushed", "scratched", "flakes", "leather", "flat", "tilted")
+    values = []
+    with run.table("exact") as table:
+        for name, make in maps_of(run, 512, *names[:1] if run.quick else names).items():
+            for kernel in KERNELS:
+                build = cache(lambda make=make, kernel=kernel: Manifold(make(), kernel, EPSILON))
+                for ellipse in ELLIPSES:
+                    if ellipse.major > 60 and (run.quick or kernel == "disk"):
+                        continue
+                    key = {"map": name, "kernel": kernel, "footprint": str(ellipse)}
+                    work = partial(exactness, build, make, kernel, ellipse)
+                    values += [row["p_value"] for row in table.measure(key, work)]
+    if values:
+        run.console.print(
+            f"{len(values)} cases, smallest p-value {min(values):.2g}, expected about "
+            f"{1 / len(values):.2g}"
+        )
+
+
+# --------------------------------------------------------------------------------------------------
+#  Filters
+# --------------------------------------------------------------------------------------------------
+
+#: Radius of the sun's disk, as half vectors.
+SUN = 0.0023
+
+
+def distance(make: Callable[[], NormalMap], sigma: float, samples: int) -> dict:
+    """Relative L1 between LEAN's lobe and the blurred binned P-NDF, and the noise's part of it."""
+    normal_map, ellipse, res, points = make(), Ellipse.round(sigma), 48, 4
+    options = {"sigma_r": SUN, "res": res, "samples": samples}
+    reference = binned_pndf(normal_map, (0.4, 0.7), ellipse.covariance(normal_map), **options)
+    m = grid_of_normals(reference.bounds, res * points)
+    footprint = ellipse.at(normal_map, np.array([[0.4], [0.7]]))
+    density = Filtered(normal_map, "lean", 2**0.5 * SUN).eval(m, footprint).numpy()
+    density = density.reshape(res, points, res, points).mean(axis=(1, 3))
+    return {"relative_l1": reference.relative_l1(density), "noise": reference.noise_floor}
+
+
+def hand_over(run: Run) -> None:
+    """LEAN's lobe against the P-NDF, blurred by the sun's disk, by the size of the footprint.
+
+    How large must a footprint be for glints to be gone?
+    """
+    size, samples = (256, 500_000) if run.quick else (512, 4_000_000)
+    names = ("isotropic", "brushed", "leather", "scratched", "flakes")
+    with run.table("hand_over") as table:
+        for name, make in maps_of(run, size, *names).items():
+            for sigma in (4, 64) if run.quick else (4, 16, 64, 128, 256):
+                work = partial(distance, make, sigma, samples)
+                table.measure({"map": name, "sigma": sigma}, work)
+
+
+#: Standard deviations of footprints, texels: levels of the chain, between levels, stretched.
+FOOTPRINTS = (
+    *((sigma, sigma) for sigma in (0.5, 1, 2**0.5, 8, 16, 1.2, 3.4, 7, 27)),
+    *((3, 2), (4, 2), (8, 2), (16, 2), (30, 1.5)),
+)
+
+
+def moment_errors(
+    make: Callable[[], NormalMap], major: float, minor: float, count: int
+) -> dict[str, float]:
+    """Errors of LEAN's moments for ``count`` random footprints of these axes, texels."""
+    normal_map = make()
+    size = np.array([normal_map.width, normal_map.height])
+    rng = np.random.default_rng(3)
+    angle = rng.uniform(0, np.pi, count)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    axes, uv = turn.transpose(2, 0, 1) * [major, minor], rng.random((count, 2))
+    du, dv = np.float32(axes / size[:, None]).transpose(2, 1, 0)
+    footprint = Footprint(mi.Point2f(np.float32(uv.T)), mi.Vector2f(du), mi.Vector2f(dv))
+    got = np.array(list(Filtered(normal_map, "lean").pyramid.average(footprint))).T
+    error = np.abs(got - slope_moments(normal_map, uv, axes))
+    mean_square = (np.linalg.norm(normal_map.roughness()) ** 2) / 2
+    first, second = error[:, :2] / mean_square**0.5, error[:, 2:] / mean_square
+    return {
+        f"{name}_{figure}": float(value)
+        for name, e in (("first", first), ("second", second))
+        for figure, value in (("rms", np.sqrt((e**2).mean())), ("max", e.max()))
+    }
+
+
+def moments(run: Run) -> None:
+    """Means and mean squares of slopes of LEAN's lobe against sums over the map's mesh, in float64.
+
+    Footprints are random; errors are relative to the root mean square slope of the map, and to its
+    square.
+    """
+    names = ("isotropic", "brushed", "leather", "scratched", "flakes")
+    size, count = (128, 4) if run.quick else (512, 24)
+    with run.table("moments") as table:
+        for name, make in maps_of(run, size, *names).items():
+            for major, minor in FOOTPRINTS:
+                key = {"map": name, "major": major, "minor": minor}
+                work = partial(moment_errors, make, major, minor, count)
+                table.measure(key, work)
+
+
+accuracy = family("accuracy", exact, hand_over, moments)

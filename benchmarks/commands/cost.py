@@ -1,0 +1,136 @@
+"""Whole renders of every method over roughconductor; the time and memory of building.
+
+The methods are those of ``benchmarks/methods.py`` that are marked for it, at their own settings.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from math import radians
+
+import mitsuba as mi
+
+from benchmarks.cases import PATCH_MAP, UV_SCALE, Surface, curved_patch, maps_of, plane, scaled
+from benchmarks.harness import Run, family, timed
+from benchmarks.measures.images import in_turn
+from benchmarks.methods import METHODS, Method, rough
+from glintbsdf import NormalMap
+from glintbsdf.scene.rendering import pixel_angle
+
+#: Footprints on the curved patch, pixels.
+PIXELS = (1 / 16, 1, 4)
+
+#: Views of the plane: degrees above it, and distances.
+ELEVATIONS, DISTANCES, FIELD_OF_VIEW = (90, 10), (1.0, 30.0), 30.0
+
+
+def on_patch(
+    method: Method, footprints: tuple[float, ...], normal_map: NormalMap, size: int, run: Run
+) -> list[dict]:
+    """A method on the curved patch under footprints of so many pixels, the structure built once."""
+    shared = {"material": "Cr", "to_uv": scaled(UV_SCALE)}
+    smooth = curved_patch(rough(normal_map, **shared), size, 16)
+    angle = pixel_angle(smooth.sensors()[0])
+    material = method.describe(Surface("patch", normal_map)) | shared | {"pixel_spread": angle}
+    glints, loading = timed(lambda: curved_patch(material, size, 16))
+    parameters = mi.traverse(glints)
+    (key,) = (key for key in parameters.keys() if key.endswith("pixel_spread"))
+    rows = []
+    for pixels in footprints:
+        parameters[key] = mi.Float(pixels * angle)
+        parameters.update()
+        times = in_turn((smooth, glints), 16, run.repetitions)
+        rows.append({"footprint": f"{pixels:g} pixels", "loading": loading} | times)
+    return rows
+
+
+def on_plane(method: Method, elevation: float, distance: float, size: int, run: Run) -> dict:
+    """A method without a map on the plane, under footprints of a pixel."""
+    view = {"elevation": elevation, "distance": distance, "fov": FIELD_OF_VIEW}
+    conductor = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3}
+    smooth = plane(conductor | {"material": "Al"}, **view, size=size, spp=16)
+    spread = radians(FIELD_OF_VIEW) / size / 16**0.5
+    material = method.plugin | {"pixel_spread": spread, "to_uv": scaled(1000), "material": "Al"}
+    glints, loading = timed(lambda: plane(material, **view, size=size, spp=16))
+    return {"loading": loading} | in_turn((smooth, glints), 16, run.repetitions)
+
+
+def renders(run: Run) -> None:
+    """Times of frames of 400², 16 samples per pixel, stock ``path``, over roughconductor's.
+
+    Methods with a map are on the curved patch, where a footprint of f pixels is a ``pixel_spread``
+    of f times a pixel's angle; ``roughconductor`` is as rough as the map. ``glint_grid`` is on a
+    plane, seen along its normal and at 10° to it, from two distances. A method and
+    ``roughconductor`` render in turn in every repetition, after a first frame that compiles, with
+    no other material alive: Dr.Jit compiles all there are into every frame. Ratios are medians of
+    those within a repetition. Loading includes building.
+    """
+    size = 100 if run.quick else 400
+    maps = {"isotropic": partial(NormalMap.load, PATCH_MAP), **maps_of(run, 0)}
+    with run.table("renders") as table:
+        for method in METHODS:
+            if not method.cost or (run.quick and not method.quick):
+                continue
+            if method.mapped:
+                for name, make in maps.items():
+                    footprints = PIXELS[:2] if run.quick else PIXELS
+                    work = partial(on_patch, method, footprints, make(), size, run)
+                    table.measure({"method": method.name, "map": name}, work)
+                continue
+            for elevation in ELEVATIONS:
+                for distance in DISTANCES:
+                    where = {"footprint": f"at {elevation}°, {distance:g} away"}
+                    work = partial(on_plane, method, elevation, distance, size, run)
+                    table.measure({"method": method.name, **where}, work)
+
+
+#: Bytes that papers report: by the type of plugin, side of the sample and of the map, and setting.
+PAPERS = {
+    ("glint_elements", 2048, 2048, "step 0.5"): 1120e6,
+    ("glint_elements", 2048, 2048, "step 1.0"): 280e6,
+    ("glint_mip", 256, 4096, "clusters 32"): 27.4e6,
+    ("glint_mip", 512, 7168, "clusters 32"): 75.8e6,
+}
+
+
+def built(method: Method, sample: NormalMap, size: int) -> dict:
+    """Time and memory of a structure; with a sample, of a map of ``size``² texels made of it."""
+    description = method.plugin | {"data": mi.TensorXf(sample.normals)}
+    if method.synthesises:
+        description |= {"output_size": size}
+    start = time.process_time()
+    bsdf, taken = timed(lambda: mi.load_dict(description))
+    setting = (method.plugin["type"], sample.width, size, method.setting)
+    return {
+        "seconds": taken,
+        "cpu_seconds": time.process_time() - start,
+        "megabytes": bsdf.pndf.nbytes / 1e6,
+        "bytes_per_texel": bsdf.pndf.nbytes / sample.width**2,
+        "paper_megabytes": PAPERS[setting] / 1e6 if setting in PAPERS else None,
+    }
+
+
+def building(run: Run) -> None:
+    """Time and memory of the structures of an isotropic map, the cache being off.
+
+    ``glint_mip`` makes its map of a sample of 256² or 512² texels, the others take it whole. Bytes
+    per texel are those of the map that the method is given. Beside them stand the paper's figures
+    where there are any: 720 MB of elements and 400 MB of hierarchy at h = ½ (Yan16), and the lobes
+    and look-up table of Table 2 (Tan22).
+    """
+    with run.table("building") as table:
+        for method in METHODS:
+            if not (method.cost and method.mapped) or (run.quick and not method.quick):
+                continue
+            sizes = [(512, 512)] if run.quick else [(2048, 2048)]
+            if method.synthesises:
+                sizes = [(256, 1024)] if run.quick else [(256, 4096), (512, 7168)]
+            for sample, size in sizes:
+                seed = 3 if method.synthesises else 1
+                (make,) = maps_of(Run(), sample, "isotropic", seed=seed).values()
+                key = {"method": method.name, "sample": sample, "size": size}
+                table.measure(key, lambda m=method, make=make, size=size: built(m, make(), size))
+
+
+cost = family("cost", renders, building)

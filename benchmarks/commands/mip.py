@@ -1,0 +1,218 @@
+"""glint_mip's lobes against the map that its look-up table implies (Tan22); the map's seams.
+
+The samples are our own, of 256² texels, made 2048². The reference is ``glint_elements`` with
+elements half a texel apart on the explicit map, as in the paper. Footprints are round and w = 2σ
+texels wide. Errors are relative L1 differences on a grid of 128² normals over the range of the
+map's, mean of three places, σ_r = 0.005. Times are those of random queries on one thread.
+
+Storage and time of building are in ``cost building``, errors by C_P and against the binned P-NDF in
+``error_vs_time``, with pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.cases import (
+    PLACES,
+    SYNTHESIS,
+    Ellipse,
+    grid_of_normals,
+    maps_of,
+    queries,
+    white_noise,
+)
+from benchmarks.harness import Run, family
+from benchmarks.measures import pndf as errors
+from benchmarks.methods import SIGMA_R
+from glintbsdf import NormalMap
+from glintbsdf.maps.quilting import lobe_features, synthesise
+from glintbsdf.pndf import Elements, Mip
+
+WIDTHS = (8, 16, 32, 64, 128, 256, 512)
+#: Wider footprints would keep the reference busy for minutes.
+WIDEST_REFERENCE = 128
+RES = 128
+
+#: A sample, and the structures made of it: by setting.
+Structures = Callable[[], dict]
+
+
+class NearestLevel(Mip):
+    """Lobes without interpolation between levels."""
+
+    def level(self, kernel):
+        below, above, fraction = super().level(kernel)
+        nearest = dr.select(fraction < 0.5, below, above)
+        return nearest, nearest, mi.Float(0)
+
+
+def samples_of(run: Run) -> dict[str, Callable[[], NormalMap]]:
+    """The samples that maps are made of."""
+    return maps_of(run, 256, *("isotropic", "scratched")[: 1 if run.quick else 2], seed=3)
+
+
+def structures(make: Callable[[], NormalMap], size: int, settings: dict[str, dict]) -> dict:
+    """The elements of the explicit map first, and lobes by setting."""
+    shared = {"output_size": size, "sigma_r": SIGMA_R}
+    lobes = {name: Mip(make(), **shared, **options) for name, options in settings.items()}
+    explicit = next(iter(lobes.values())).normal_map
+    return {"elements": Elements(explicit, sigma_r=SIGMA_R, step=0.5)} | lobes
+
+
+def all_normals(normal_map: NormalMap) -> mi.Vector2f:
+    """The grid of normals over the range of the map's."""
+    normals = normal_map.normals.reshape(-1, 2)
+    return grid_of_normals((normals.min(axis=0), normals.max(axis=0)), RES)
+
+
+def density_at(pndf, uv: tuple, width: float, m: mi.Vector2f) -> np.ndarray:
+    """The P-NDF of a footprint ``width`` texels across."""
+    footprint = Ellipse.round(width / 2).at(pndf.normal_map, np.array(uv)[:, None])
+    return pndf.eval(m, footprint).numpy()
+
+
+def relative_l1(a: np.ndarray, b: np.ndarray) -> float:
+    """Relative L1 difference of ``a`` to ``b``."""
+    return float(np.abs(a - b).sum() / b.sum())
+
+
+def compared(build: Structures, width: float, repetitions: int) -> list[dict]:
+    """Errors and times of several settings under footprints of one width."""
+    built = build()
+    if width > WIDEST_REFERENCE:
+        built = {name: pndf for name, pndf in built.items() if name != "elements"}
+    first = next(iter(built.values()))
+    m = all_normals(first.normal_map)
+    many = queries(first.normal_map, Ellipse.round(width / 2), 2**13)
+    per_query, ratios = errors.times(list(built.values()), many, repetitions)
+    densities = {
+        name: np.array([density_at(pndf, uv, width, m) for uv in PLACES])
+        for name, pndf in built.items()
+    }
+    exact = densities.get("elements")
+    return [
+        {
+            "setting": name,
+            "relative_l1": None if exact is None else relative_l1(densities[name], exact),
+            "microseconds": 1e6 * float(taken),
+            "faster_than_elements": None if exact is None else ratio,
+            "megabytes": pndf.nbytes / 1e6,
+        }
+        for (name, pndf), taken, ratio in zip(built.items(), per_query, ratios, strict=True)
+    ]
+
+
+def clusters(run: Run) -> None:
+    """Error, time and memory over footprints by the number of lobes, k (Fig. 13)."""
+    settings = {f"k = {k}": {"clusters": k} for k in (16, 32, 64)}
+    size = 1024 if run.quick else 2048
+    with run.table("clusters") as table:
+        for sample, make in samples_of(run).items():
+            build = cache(partial(structures, make, size, settings))
+            for width in WIDTHS[1::2] if run.quick else WIDTHS:
+                work = partial(compared, build, width, run.repetitions)
+                table.measure({"sample": sample, "width": width}, work)
+
+
+def largest_jump(pndf: Mip) -> dict:
+    """The largest relative L1 change while the footprint grows by 1 % from 16 to 128 texels."""
+    m, before, jumps = all_normals(pndf.normal_map), None, []
+    for width in 16 * 1.01 ** np.arange(0, np.log(8) / np.log(1.01)):
+        now = density_at(pndf, PLACES[0], width, m)
+        jumps += [] if before is None else [relative_l1(now, before)]
+        before = now
+    return {"largest_jump": max(jumps)}
+
+
+def interpolation(run: Run) -> None:
+    """The largest change of the P-NDF while the footprint grows by 1 % (Fig. 14).
+
+    With two levels blended, and with the nearest one alone. Expected: without interpolation, jumps
+    of as much as the error, 0.2; with it, below 0.02.
+    """
+    size = 1024 if run.quick else 2048
+    with run.table("interpolation") as table:
+        for sample, make in samples_of(run).items():
+            for levels, kind in (("blended", Mip), ("nearest", NearestLevel)):
+                options = {"output_size": size, "sigma_r": SIGMA_R}
+                table.measure(
+                    {"sample": sample, "levels": levels},
+                    lambda kind=kind, make=make, o=options: largest_jump(kind(make(), **o)),
+                )
+
+
+# --------------------------------------------------------------------------------------------------
+#  Seams
+# --------------------------------------------------------------------------------------------------
+
+
+def seam(run: Run, make: Callable[[], NormalMap], sample: str, patch: int, overlap: int) -> dict:
+    """Roughness across overlaps and cuts over that inside, and repetition."""
+    size, given = 512 if run.quick else 1024, make()
+    synthesis = synthesise(given, size, patch, overlap)
+    normals = synthesis.explicit()
+    features = lobe_features(normals, SYNTHESIS["balance"])
+    index = np.arange(size)
+    source = np.concatenate(
+        [synthesis.source(*np.broadcast_arrays(y[:, None], index)) for y in np.split(index, 8)]
+    )
+    across, cut, inside = [], [], []
+    for axis in (0, 1):
+        difference = ((features - np.roll(features, 1, axis)) ** 2).sum(axis=2)
+        place = (synthesis.starts[:-1, None] + np.arange(overlap + 1)) % size
+        in_overlap = np.isin(index, place)
+        step = given.width if axis == 0 else 1
+        cut.append(difference[source - np.roll(source, 1, axis) != step])
+        difference = np.moveaxis(difference, axis, 0)
+        across.append(difference[in_overlap].ravel())
+        inside.append(difference[~in_overlap].ravel())
+    across, cut, inside = (np.concatenate(v) for v in (across, cut, inside))
+    z = np.sqrt(1 - (normals**2).sum(axis=2, keepdims=True))
+    shown = np.clip(np.concatenate((0.5 + normals, z), axis=2)[:768, :768], 0, 1)
+    run.save_pictures(f"mip_map_{sample}_{patch}_{overlap}", [[shown]])
+    row = {
+        "mean": across.mean() / inside.mean(),
+        "percentile_99": np.percentile(across, 99) / np.percentile(inside, 99),
+        "cut": cut.mean() / inside.mean(),
+        "repetition": repetition(normals, patch),
+        "best_only": synthesis.best_only / synthesis.patch.size,
+        "most_frequent": np.bincount(synthesis.patch.ravel()).max() / synthesis.patch.size,
+    }
+    return {key: float(value) for key, value in row.items()}
+
+
+def repetition(normals: np.ndarray, patch: int) -> float:
+    """The highest autocorrelation of a map at distances from half a patch to four patches."""
+    spectrum = np.fft.rfft2(normals - normals.mean(axis=(0, 1)), axes=(0, 1))
+    correlation = np.fft.irfft2((np.abs(spectrum) ** 2).sum(axis=2), s=normals.shape[:2])
+    shift = np.minimum(np.arange(len(normals)), len(normals) - np.arange(len(normals)))
+    distance = np.maximum(shift[:, None], shift)
+    near = (distance > patch / 2) & (distance < 4 * patch)
+    return float(correlation[near].max() / correlation[0, 0])
+
+
+def seams(run: Run) -> None:
+    """Seams of maps that are made of patches, and how much of a map repeats.
+
+    The squared difference (Eq. 7) of neighbouring texels in the overlaps over that inside of
+    patches, mean and 99th percentile; and that of the texels on either side of a cut. Repetition is
+    the autocorrelation of normals at its highest, half a patch to four patches away;
+    ``most_frequent`` is the largest share of cells that show the same patch.
+    """
+    samples = maps_of(run, 256, "isotropic", "leather", "brushed", "scratched", "flakes", seed=3)
+    samples["noise"] = partial(white_noise, (256, 256))
+    sizes = ((64, 2), (64, 6)) if run.quick else ((64, 2), (64, 6), (64, 12), (128, 12))
+    with run.table("seams") as table:
+        for name, make in samples.items():
+            for patch, overlap in sizes:
+                key = {"sample": name, "patch": patch, "overlap": overlap}
+                table.measure(key, partial(seam, run, make, **key))
+
+
+mip = family("mip", clusters, interpolation, seams)

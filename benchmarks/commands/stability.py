@@ -1,0 +1,428 @@
+"""Numerical stability of every method on stiff and extreme cases: one table of broken bounds.
+
+Every method meets every stiff map, from flat to white noise up to the disk's rim and down to a
+single texel, and its own stiff parameter over eight decades. A row of the table is one method on
+one map; docs/reports/stability.rst explains the columns and their bounds.
+
+Errors of estimates count as often as makes the significance of the whole table 0.01. Lobes that are
+narrower than a hundred times the error of a half vector are asked for numbers that are finite and
+not negative, and for no more: what is in parentheses is not judged.
+
+The table is printed, and written to the folder as ``stability.json``, ``stability.csv`` and
+``stability.html``. The exit status is 1 if a bound is broken.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import click
+import mitsuba as mi
+import numpy as np
+import scipy.stats
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.cases import STIFF_SIZE
+from benchmarks.harness import (
+    VARIANT,
+    Store,
+    machine,
+    new_console,
+    open_store,
+    output_option,
+)
+from benchmarks.methods import NARROWEST_LOBE, NO_MAP, STIFF, VERTICAL, WIDTHS, Stiff, stiff_map
+from benchmarks.report import page
+from glintbsdf.check import densities, robustness
+from glintbsdf.check.suite import View
+from glintbsdf.cli.entry import interruptible
+from glintbsdf.core.progress import progress
+from glintbsdf.scene.rendering import replacing
+
+#: Maps on which parameters are swept, and on which pictures are made; the latter is what is left
+#: of all maps in a hurry.
+SWEPT, STIFFEST = ("step edge", *NO_MAP), ("white noise", *NO_MAP)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on one map, with one parameter changed or none."""
+
+    method: str
+    map: str
+    parameter: str = ""
+    value: float = 0.0
+    quick: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.method} | {self.map}" + (
+            f" | {self.parameter} {self.value:g}" if self.parameter else ""
+        )
+
+    def description(self) -> dict:
+        """For ``mi.load_dict``; footprints of a query without UV partials are cones."""
+        method = STIFF[self.method]
+        description = {
+            "type": method.plugin,
+            "footprint_sigma": 1.0,
+            "pixel_spread": 1e-3,
+            **method.parameters,
+        }
+        if self.map not in NO_MAP:
+            normal_map = stiff_map(self.map)
+            description["data"] = mi.TensorXf(normal_map.normals)
+            description["wrap_mode"] = normal_map.wrap_mode
+        if self.parameter:
+            description[self.parameter] = self.value
+        return description
+
+
+def plan(quick: bool) -> Iterator[Row]:
+    """All rows of the table."""
+    for name, method in STIFF.items():
+        yield from (
+            Row(name, map_name, quick=quick)
+            for map_name in method.maps
+            if not quick or map_name in STIFFEST
+        )
+        parameter, values = method.sweep
+        yield from (
+            Row(name, map_name, parameter, value, quick)
+            for map_name in method.maps
+            if map_name in SWEPT
+            for value in (values[: is_first(name)] if quick else values)
+        )
+
+
+def is_first(name: str) -> bool:
+    """Whether a method is the first of its plugin."""
+    plugin = STIFF[name].plugin
+    return name == next(other for other, method in STIFF.items() if method.plugin == plugin)
+
+
+def measure(row: Row) -> dict:
+    """Everything that is measured of a row, by name; ``errors`` holds messages of what failed."""
+    method, description = STIFF[row.method], row.description()
+
+    def load() -> mi.BSDF:
+        return mi.load_dict(description)
+
+    try:
+        bsdf = load()
+    except Exception as error:
+        return {"errors": {"load": in_a_line(error)}}
+    texels, spread = extent(row, bsdf)
+    samples = 1 << (13 if row.quick else 14)
+    views = robustness.views(texels, row.quick, method.large)
+    energy_views = promised(method, robustness.energy_views(texels))
+    measured = {
+        "extremes": lambda: robustness.extremes(bsdf, method.lanes),
+        "densities": lambda: [
+            {"view": name, **densities.density(bsdf, view, samples)} for name, view in views.items()
+        ],
+        "energies": lambda: robustness.energy(
+            bsdf, energy_views, (2 if row.quick else 8) * method.lanes, spread
+        ),
+        "energy_limit": lambda: energy_limit(row),
+        "resolved": lambda: (
+            row.parameter not in WIDTHS or WIDTHS[row.parameter](row.value) >= NARROWEST_LOBE
+        ),
+    }
+    if method.plugin == "glint_grid":
+        measured["mean"] = lambda: robustness.mean_of_grid(bsdf, 1 << 16)
+    if method.double:
+        measured["double"] = lambda: robustness.double_error(bsdf, load, 4 * method.lanes)
+    if row.map in STIFFEST and not row.parameter and (is_first(row.method) or not row.quick):
+        measured["bright"] = lambda: robustness.bright_light(bsdf)
+
+    result, errors = {}, {}
+    for name, figure in measured.items():
+        try:
+            with interruptible():
+                result[name] = figure()
+        except Exception as error:
+            errors[name] = in_a_line(error)
+    return result | {"errors": errors}
+
+
+def in_a_line(error: Exception) -> str:
+    """What an error says: Mitsuba quotes all of Python's traceback, whose last line it is."""
+    lines = [line.strip() for line in f"{type(error).__name__}: {error}".splitlines()]
+    return next((line for line in reversed(lines) if "Error: " in line), lines[0])
+
+
+def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
+    """Texels, flakes or finest cells per unit of UV, and how far apart places are to lie.
+
+    Only on average over places does ``glint_grid`` keep the energy.
+    """
+    method = STIFF[row.method]
+    if method.plugin == "glint_grid":
+        cells = float(bsdf.pndf.scale[0])
+        return cells, 1e4 / cells
+    if row.map in NO_MAP:
+        return method.parameters["flake_density"] ** 0.5, 0.0
+    return max(stiff_map(row.map).normals.shape[:2]), 0.0
+
+
+def promised(method: Stiff, views: list[View]) -> list[View]:
+    """The views from which the method keeps the energy."""
+    if method.furnace == VERTICAL:
+        return [view for view in views if view.wi[2] == 1]
+    return views
+
+
+#: The most that Oren and Nayar's model reflects of uniform light, along the horizon: A + B/2, of
+#: all roughnesses.
+OREN_NAYAR = 1.0152
+
+
+def energy_limit(row: Row) -> float:
+    """The largest share of uniform light that a method may reflect."""
+    if row.method == "diffuse":
+        normals = stiff_map(row.map).normals.astype(np.float64)
+        return float((0.5 + 0.5 / np.sqrt(1 - (normals**2).sum(-1))).max())
+    if STIFF[row.method].parameters.get("method") == "oren_nayar":
+        return OREN_NAYAR
+    # Masking is that of the map, from which D may be ``max_error`` off.
+    description = STIFF[row.method].parameters | {row.parameter: row.value}
+    return 1 + description.get("max_error", 0.0)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Bounds
+# --------------------------------------------------------------------------------------------------
+
+SIGNIFICANCE = 0.01
+MASS_BOUND, DOUBLE_BOUND, BRIGHT_BOUND = 1e-3, 1e-3, 1e-5
+LAST_DIGITS = 4  # of the input, that rounding may amount to
+UNRESOLVED = 0.01  # an integral of a larger error says nothing
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One figure of the table; ``text`` is empty where the column does not apply."""
+
+    text: str = ""
+    broken: bool = False
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Bounds for a table of ``tests`` statistical tests of a kind."""
+
+    tests: int
+
+    @property
+    def smallest_p(self) -> float:
+        """Significance of a single test, by Šidák's correction."""
+        return 1 - (1 - SIGNIFICANCE) ** (1 / self.tests)
+
+    @property
+    def sigmas(self) -> float:
+        """Standard errors that an estimate may be off."""
+        return float(scipy.stats.norm.isf(self.smallest_p / 2))
+
+    def bounds(self) -> dict[str, str]:
+        """The bound of each column, in words."""
+        error = f"{self.sigmas:.1f} errors"
+        return {
+            "NaN": "0",
+            "negative": "0",
+            "∫D − 1": f"≤ {MASS_BOUND:g} + {error}; error ≤ {UNRESOLVED:g}",
+            "float64": f"≤ {DOUBLE_BOUND:g} + {LAST_DIGITS} last digits",
+            "χ²": f"p ≥ {self.smallest_p:.2g}",
+            "furnace": f"≤ 1 + {MASS_BOUND:g} + {error}",
+            "bright": f"≤ {BRIGHT_BOUND:g}",
+        }
+
+    def cells(self, result: dict) -> dict[str, Cell]:
+        """The columns of a measured row; those that do not apply are empty."""
+        verdicts = {
+            "NaN": ("extremes", self.nan),
+            "negative": ("extremes", self.negative),
+            "∫D − 1": ("densities", self.mass),
+            "float64": ("double", self.double),
+            "χ²": ("densities", self.chi_squared),
+            "furnace": ("energies", self.furnace),
+            "bright": ("bright", self.bright),
+        }
+        cells = {}
+        for name, (measured, verdict) in verdicts.items():
+            cells[name] = Cell()
+            if {measured, "load"} & set(result["errors"]):
+                cells[name] = Cell("error", True)
+            elif measured in result:
+                cells[name] = verdict(result)
+        if not result.get("resolved", True):
+            for name in ("∫D − 1", "float64", "χ²"):
+                cells[name] = Cell(f"({cells[name].text})")
+        return cells
+
+    def nan(self, result: dict) -> Cell:
+        return Cell(str(result["extremes"]["nan"]), result["extremes"]["nan"] > 0)
+
+    def negative(self, result: dict) -> Cell:
+        return Cell(str(result["extremes"]["negative"]), result["extremes"]["negative"] > 0)
+
+    def mass(self, result: dict) -> Cell:
+        """The integral that is farthest beyond its error."""
+        masses = [*result["densities"], *result.get("mean", [])]
+        worst = max(masses, key=lambda d: self.beyond(abs(d["mass"]), d["mass_error"]))
+        value, error = worst["mass"], worst["mass_error"]
+        kept = self.beyond(abs(value), error) <= MASS_BOUND and error <= UNRESOLVED
+        return Cell(f"{value:+.4f} ± {error:.4f}", not kept)
+
+    def double(self, result: dict) -> Cell:
+        error, last_digit = result["double"]["error"], result["double"]["last_digit"]
+        return Cell(f"{error:.1e}", not error <= DOUBLE_BOUND + LAST_DIGITS * last_digit)
+
+    def chi_squared(self, result: dict) -> Cell:
+        smallest = min(density["p_value"] for density in result["densities"])
+        return Cell(f"{smallest:.2g}", not smallest >= self.smallest_p)
+
+    def furnace(self, result: dict) -> Cell:
+        """The energy that is farthest beyond its error."""
+        worst = max(result["energies"], key=lambda e: self.beyond(e["energy"], e["error"]))
+        kept = self.beyond(worst["energy"], worst["error"]) <= result["energy_limit"] + MASS_BOUND
+        limit = result["energy_limit"]
+        text = f"{worst['energy']:.3f} ± {worst['error']:.3f}"
+        return Cell(text + (f" of {limit:.3g}" if limit != 1 else ""), not kept)
+
+    def bright(self, result: dict) -> Cell:
+        bright = result["bright"]
+        kept = bright["apart"] <= BRIGHT_BOUND and not bright["nan"] and not bright["negative"]
+        return Cell(f"{bright['apart']:.1e}", not kept)
+
+    def beyond(self, value: float, error: float) -> float:
+        """What noise does not explain of a value; NaN stays the largest."""
+        value = value - self.sigmas * error
+        return value if np.isfinite(value) else np.inf
+
+
+def test_count(rows: list[Row]) -> int:
+    """Statistical tests in a table, of the kind there are most of."""
+    return max(
+        sum(len(robustness.views(STIFF_SIZE, row.quick, STIFF[row.method].large)) for row in rows),
+        sum(len(promised(STIFF[row.method], robustness.energy_views(STIFF_SIZE))) for row in rows),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+#  Reports
+# --------------------------------------------------------------------------------------------------
+
+Finished = list[tuple[Row, dict]]
+
+
+def rich_table(finished: Finished, judge: Judge) -> Table:
+    """The table for the terminal."""
+    words = "; ".join(f"{name} {bound}" for name, bound in judge.bounds().items())
+    table = Table(title="Stability", caption=words)
+    for name in ("method", "map", "parameter", *judge.bounds()):
+        table.add_column(name)
+    for row, result in finished:
+        cells = judge.cells(result).values()
+        table.add_row(*labels(row), *(f"[red]{c.text} ✗[/]" if c.broken else c.text for c in cells))
+    return table
+
+
+def messages(finished: Finished) -> list[str]:
+    """What went wrong, a line for each measure of a row."""
+    return [
+        f"{row.name}: {name}: {message}"
+        for row, result in finished
+        for name, message in result["errors"].items()
+    ]
+
+
+def labels(row: Row) -> tuple[str, str, str]:
+    return row.method, row.map, f"{row.parameter} {row.value:g}" if row.parameter else ""
+
+
+def write_reports(folder: Path, finished: Finished, judge: Judge) -> None:
+    """Write JSON, CSV and HTML; each file appears whole or not at all."""
+    header = {
+        "machine": machine(__file__),
+        "bounds": judge.bounds(),
+        "significance": SIGNIFICANCE,
+        "tests": judge.tests,
+    }
+    judged = [(row, result, judge.cells(result)) for row, result in finished]
+    rows = [
+        asdict(row)
+        | {"result": result, "broken": [name for name, cell in cells.items() if cell.broken]}
+        for row, result, cells in judged
+    ]
+    with replacing(folder / "stability.json") as path:
+        path.write_text(json.dumps(header | {"rows": rows}, indent=1) + "\n")
+    with replacing(folder / "stability.csv") as path, path.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["method", "map", "parameter", *judge.bounds(), "broken"])
+        for row, _, cells in judged:
+            broken = " ".join(name for name, cell in cells.items() if cell.broken)
+            writer.writerow([*labels(row), *(cell.text for cell in cells.values()), broken])
+    with replacing(folder / "stability.html") as path:
+        text = page.fill(
+            "stability.html.jinja", rows=judged, labels=labels, bounds=judge.bounds(),
+            machine=header["machine"], errors=messages(finished), about=__doc__,
+        )  # fmt: skip
+        path.write_text(text, encoding="utf-8")
+
+
+# --------------------------------------------------------------------------------------------------
+#  The run
+# --------------------------------------------------------------------------------------------------
+
+
+def finish(row: Row, store: Store) -> dict:
+    """Measure a row, or take it from an earlier run. An error is a result, Ctrl-C is not."""
+
+    def measured() -> tuple[dict, dict]:
+        start = time.perf_counter()
+        result = measure(row)
+        return result | {"seconds": round(time.perf_counter() - start, 2)}, {}
+
+    return store.get(asdict(row) | asdict(STIFF[row.method]), measured)[0]
+
+
+def run(rows: list[Row], folder: Path, console: Console) -> int:
+    """Measure the rows, report, and return the exit status."""
+    store, judge, finished = open_store(folder, __file__), Judge(test_count(rows)), []
+    status = 0
+    try:
+        with progress("Stability") as report:
+            for row in rows:
+                finished.append((row, finish(row, store)))
+                report(len(finished) / len(rows))
+    except KeyboardInterrupt:
+        console.print(
+            f"Interrupted after {len(finished)} of {len(rows)} rows; run it again to go on."
+        )
+        status = 130
+    write_reports(folder, finished, judge)
+    console.print(rich_table(finished, judge), *messages(finished), sep="\n")
+    broken = sum(any(c.broken for c in judge.cells(result).values()) for _, result in finished)
+    console.print(
+        f"{len(finished)} rows, {broken} with a broken bound: {folder / 'stability.html'}"
+    )
+    return status or int(broken > 0)
+
+
+@click.command(help=__doc__, short_help=__doc__.splitlines()[0])
+@click.option("--quick", is_flag=True, help="The stiffest maps alone, in two minutes.")
+@click.option("--only", metavar="TEXT", default="", help="Rows whose name holds this.")
+def stability(quick: bool, only: str, output: Path, variant: str) -> int:
+    mi.set_variant(variant)
+    rows = [row for row in plan(quick) if only in row.name]
+    return run(rows, output, new_console())
+
+
+stability.params += [output_option(required=True), VARIANT]

@@ -1,0 +1,1 @@
+"""What is measured: plain functions that return numbers, and do not judge."""
