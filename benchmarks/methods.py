@@ -1,4 +1,8 @@
-"""What is compared: every method at a ladder of settings. One list serves all commands."""
+"""What is compared: every method at a ladder of settings. One list serves all commands.
+
+A method of the register (:func:`glintbsdf.pndf.methods`) that has no ladder here takes part with
+the settings that it is registered with.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ import mitsuba as mi
 from benchmarks.cases import STIFF_MAPS, STIFF_SIZE, SYNTHESIS, Case, Surface
 from glintbsdf import NormalMap
 from glintbsdf.check.truth import mirrors
+from glintbsdf.pndf import methods
 from glintbsdf.pndf.manifold.mesh import equilateral
 
 #: Roughness σ_r on the disk that elements, lobes and filters add to the map, so that they answer
@@ -25,7 +30,8 @@ class Method:
 
     ``plugin`` is its dictionary for ``mi.load_dict``, without the map. ``rung`` is the number that
     the ladder of its family goes by, if it does. ``quick`` says whether the quick report has it;
-    ``pndf``, ``image`` and ``cost`` whether it is compared at that level.
+    ``pndf``, ``image`` and ``cost`` whether it is compared at that level; ``mapped`` whether it has
+    a map: one without can only be compared in ``cost``.
     """
 
     family: str
@@ -36,15 +42,11 @@ class Method:
     pndf: bool = True
     image: bool = True
     cost: bool = True
+    mapped: bool = True
 
     @property
     def name(self) -> str:
         return f"{self.family}, {self.setting}"
-
-    @property
-    def mapped(self) -> bool:
-        """Whether it has a map."""
-        return self.plugin["type"] != "glint_grid"
 
     @property
     def synthesises(self) -> bool:
@@ -101,9 +103,10 @@ def ladder(
 
 
 def glitter(setting: str, **parameters: object) -> Method:
-    """A setting of ``glint_grid``, which has no map to be compared with: only its cost is."""
+    """A setting of ``glint_grid``."""
     plugin = {"type": "glint_grid", **parameters}
-    return Method("grid", setting, plugin, quick=setting == "density 8", pndf=False, image=False)
+    return Method("grid", setting, plugin, quick=setting == "density 8", pndf=False, image=False,
+                  mapped=False)  # fmt: skip
 
 
 manifold = partial(ladder, type="glint_manifold")
@@ -116,7 +119,7 @@ THRESHOLDS = (1e-2, 1e-3, 1e-4)
 TABLES = (0.2, 0.1, 0.05, 0.02, 0.01)
 FILTERS = ("toksvig", "clean", "variance", "lean")
 
-METHODS = [
+LADDERS = [
     EXACT,
     *manifold("manifold, tables", "max_error", TABLES, quick=(0.2, 0.05), image=(0.05,),
               cost=(0.05,)),
@@ -136,6 +139,18 @@ METHODS = [
     glitter("wheel", colors="wheel"),
     glitter("grooves", detail_alpha_u=0.3),
     glitter("equal sizes", size_variation=0.0),
+]  # fmt: skip
+
+
+REGISTERED = [
+    entry
+    for entry in methods().values()
+    if entry.plugin and entry.plugin not in {method.plugin["type"] for method in LADDERS}
+]
+METHODS = LADDERS + [
+    Method(entry.title, "as registered", {"type": entry.plugin, **entry.settings},
+           pndf=entry.takes_map, image=entry.takes_map, mapped=entry.takes_map)
+    for entry in REGISTERED
 ]  # fmt: skip
 
 
@@ -225,7 +240,11 @@ STIFF: dict[str, Stiff] = {
     "toksvig, GGX": filtered({"method": "toksvig", "distribution": "ggx"}, VERTICAL),
     "variance": filtered({"method": "variance"}, VERTICAL),
     "variance, GGX": filtered({"method": "variance", "distribution": "ggx"}, VERTICAL),
-}
+} | {
+    entry.title: Stiff(entry.plugin, dict(entry.settings), VERTICAL,
+                       maps=tuple(STIFF_MAPS) if entry.takes_map else NO_MAP)
+    for entry in REGISTERED
+}  # fmt: skip
 
 #: Widths of lobes of normals that parameters stand for (of a degenerate triangle the radius of the
 #: circle in it), and the narrowest that can be judged: float32 half vectors are 6e-8 apart, and

@@ -139,7 +139,9 @@ def moment_errors(
     axes, uv = turn.transpose(2, 0, 1) * [major, minor], rng.random((count, 2))
     du, dv = np.float32(axes / size[:, None]).transpose(2, 1, 0)
     footprint = Footprint(mi.Point2f(np.float32(uv.T)), mi.Vector2f(du), mi.Vector2f(dv))
-    got = np.array(list(Filtered(normal_map, "lean").pyramid.average(footprint))).T
+    averages = Filtered(normal_map, "lean").pyramid.average(footprint)
+    x, y, xx, yy, xy = (np.array(v, np.float64) for v in averages)  # a mean and a covariance
+    got = np.stack([x, y, xx + x * x, yy + y * y, xy + x * y], axis=1)
     error = np.abs(got - slope_moments(normal_map, uv, axes))
     mean_square = (np.linalg.norm(normal_map.roughness()) ** 2) / 2
     first, second = error[:, :2] / mean_square**0.5, error[:, 2:] / mean_square

@@ -8,10 +8,8 @@ that is as rough. *Image level*: the curved patch against brute force at log-spa
 samples, several seeds; footprints shrink with the number of samples, as ``glintbsdf render`` has
 it. All methods run in turn within every repetition; building and compiling are timed apart.
 
-The folder gets ``report.html``, one page with everything in it; ``report.json`` (see
-``benchmarks/report/schema.json``), ``pndf.csv``, ``images.csv`` and ``which_when.csv``, the fastest
-method per map, footprint and error; and ``figures``. The fronts of error against time are printed.
-The command needs the ``docs`` extra (matplotlib, Jinja2).
+The folder gets ``report.html``, one page with everything in it; the same as JSON and CSV;
+``which_when.csv``, the fastest method per map, footprint and error; and ``figures``.
 """
 
 from __future__ import annotations

@@ -172,15 +172,12 @@ def moved(run: Run, ratio: float, motion: str, cells: str) -> dict:
 def motion(run: Run) -> None:
     """Stability of pictures under motion of the camera by fractions of a pixel (Zirr16, Fig. 5).
 
-    32 frames of a plane, one query per pixel, with round pixels and pixels of 16:1. The plane pans
-    by an eighth of a pixel per frame; or the camera recedes until pixels are 2.2 times as large,
-    about points that stay, so that every pixel changes its grids once. Printed is the mean absolute
-    difference of a pixel between frames, relative to that between pictures of independent
-    microdetails (another seed). "coherent" are the plugin's grids; "blended" the same without
-    coherence: grids of two levels share nothing (Fig. 5, left); "single" one grid, the level
-    nearest to the pixel's size, the cell at the pixel's centre.
-
-    "worst" is the largest difference of one frame to the next, relative to the mean of the
+    A plane, one query per pixel, with round pixels and pixels of 16:1, pans by an eighth of a pixel
+    per frame; or the camera recedes until pixels are 2.2 times as large, about points that stay, so
+    that every pixel changes its grids once. Printed is the mean absolute difference of a pixel
+    between frames, relative to that between pictures of independent microdetails (another seed).
+    "coherent" are the plugin's grids; "blended" grids of two levels share nothing (Fig. 5, left);
+    "single" is one grid, the cell at the pixel's centre. "worst" is the largest difference of one frame to the next, relative to the mean of the
     sequence: near 1 without popping.
     """
     with run.table("motion") as table:

@@ -14,6 +14,7 @@ from benchmarks.cases import MAPS, maps_of, picture_of, scaled
 from benchmarks.harness import Run, family, rmse, seconds
 from benchmarks.measures.pndf import mean_of
 from glintbsdf import Footprint, NormalMap
+from glintbsdf.footprint.query import Query
 from glintbsdf.microfacet.frame import normal_from_projection
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
@@ -127,17 +128,19 @@ def energies(mesh: TexelMesh, masking: ProjectedAreaMasking, sigma: float, quick
     u = np.mgrid[:count, :side, :side][1:] + rng.random((2, count, side, side))
     u = np.minimum(np.float32(u / side), np.float32(1 - 2**-24)).reshape(2, -1)
     wi, uv = (np.float32(v).repeat(side * side, axis=1) for v in (w, uv))
-    wi, footprint = (
-        mi.Vector3f(wi),
-        Footprint.isotropic(mi.Point2f(uv), dr.opaque(mi.Float, sigma)),
-    )
+    wi = mi.Vector3f(wi)
+    footprint = Footprint.isotropic(mi.Point2f(uv), dr.opaque(mi.Float, sigma))
     kernel = mesh.texel_kernel(footprint)
     m = normal_from_projection(mesh.normal_at(kernel.mean + kernel.sample(mi.Point2f(u))))
     facing = dr.dot(wi, m)
     wo = 2 * facing * m - wi
     up = (facing > 0) & (wo.z > 0)
     wo = dr.select(up, wo, mi.Vector3f(0, 0, 1))
-    value = facing / (m.z * wi.z) * masking.eval(wi, wo, footprint, up)
+    value = (
+        facing
+        / (m.z * wi.z)
+        * masking.eval(wi, wo, Query(footprint), mi.TransportMode.Radiance, up)
+    )
     value = np.array(dr.select(up, value, 0), np.float64).reshape(count, -1)
     energy, error = value.mean(1), value.std(1) / side
     worst = int(np.argmax(energy - 3 * error))

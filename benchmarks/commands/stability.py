@@ -168,7 +168,7 @@ def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
         cells = float(bsdf.pndf.scale[0])
         return cells, 1e4 / cells
     if row.map in NO_MAP:
-        return method.parameters["flake_density"] ** 0.5, 0.0
+        return method.parameters.get("flake_density", 1e3) ** 0.5, 0.0
     return max(stiff_map(row.map).normals.shape[:2]), 0.0
 
 

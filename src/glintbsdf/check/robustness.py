@@ -20,6 +20,7 @@ import numpy as np
 from glintbsdf.check import suite
 from glintbsdf.check.suite import View
 from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.query import Query
 from glintbsdf.pndf import Grid
 
 Array = np.ndarray
@@ -243,14 +244,15 @@ class Queries:
 
     def value(self, bsdf: object, m: object) -> Array:
         """D(m) G of a glossy BSDF, or the value of a diffuse one; ``m``: Mitsuba's names."""
-        footprint = Footprint(m.Point2f(self.uv), m.Vector2f(self.du), m.Vector2f(self.dv))
+        query = Query(Footprint(m.Point2f(self.uv), m.Vector2f(self.du), m.Vector2f(self.dv)))
         wi, wo = m.Vector3f(self.wi), m.Vector3f(self.wo)
-        if hasattr(bsdf, "method"):
-            value = bsdf.method.eval(wi, wo, mi.TransportMode.Radiance, footprint, True)
+        mode, active = mi.TransportMode.Radiance, mi.Bool(True)
+        if getattr(bsdf, "pndf", None) is None:
+            value = bsdf.method.eval(wi, wo, mode, query, active)
         else:
-            value = bsdf.pndf.eval(m.Vector2f(self.m), footprint, True)
+            value = bsdf.pndf.eval(m.Vector2f(self.m), query, active)
             if bsdf.masking is not None:
-                value = value * bsdf.masking.eval(wi, wo, footprint, True)
+                value = value * bsdf.masking.eval(wi, wo, query, mode, active)
         # One channel tells all: glints with colours share their density.
         return np.atleast_2d(np.array(value))[0]
 
