@@ -175,10 +175,10 @@ def motion(run: Run) -> None:
     A plane, one query per pixel, with round pixels and pixels of 16:1, pans by an eighth of a pixel
     per frame; or the camera recedes until pixels are 2.2 times as large, about points that stay, so
     that every pixel changes its grids once. Printed is the mean absolute difference of a pixel
-    between frames, relative to that between pictures of independent microdetails (another seed).
+    between frames, relative to that between pictures of independent microdetails (another seed);
+    "worst" is the largest of one frame to the next over the mean: near 1 without popping.
     "coherent" are the plugin's grids; "blended" grids of two levels share nothing (Fig. 5, left);
-    "single" is one grid, the cell at the pixel's centre. "worst" is the largest difference of one frame to the next, relative to the mean of the
-    sequence: near 1 without popping.
+    "single" is one grid, the cell at the pixel's centre.
     """
     with run.table("motion") as table:
         for ratio in (1, 16):

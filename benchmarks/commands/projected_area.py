@@ -136,11 +136,8 @@ def energies(mesh: TexelMesh, masking: ProjectedAreaMasking, sigma: float, quick
     wo = 2 * facing * m - wi
     up = (facing > 0) & (wo.z > 0)
     wo = dr.select(up, wo, mi.Vector3f(0, 0, 1))
-    value = (
-        facing
-        / (m.z * wi.z)
-        * masking.eval(wi, wo, Query(footprint), mi.TransportMode.Radiance, up)
-    )
+    masked = masking.eval(wi, wo, Query(footprint), mi.TransportMode.Radiance, up)
+    value = facing / (m.z * wi.z) * masked
     value = np.array(dr.select(up, value, 0), np.float64).reshape(count, -1)
     energy, error = value.mean(1), value.std(1) / side
     worst = int(np.argmax(energy - 3 * error))

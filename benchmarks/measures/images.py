@@ -143,8 +143,7 @@ def truth(surface: Surface, scale: float, settings: Settings):
 def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
     """An image with footprints of ``spp`` samples per pixel, and the seconds of rendering alone."""
     parameters = mi.traverse(scene)
-    parameters.keep([r".*pixel_spread$"])
-    for key in parameters.keys():
+    for key in (key for key in parameters.keys() if key.endswith("pixel_spread")):
         # Opaque, so that one kernel serves all numbers of samples.
         parameters[key] = dr.opaque(mi.Float, pixel_angle(scene.sensors()[0]) / spp**0.5)
     parameters.update()
