@@ -24,6 +24,18 @@ Path tracer with footprints (:monosp:`glint_path`)
    - |bool|
    - Separate direct and indirect illumination, see below. (Default: no, i.e. |false|)
 
+ * - pixel_share
+   - |string| or |float|
+   - Share of the pixel filter's variance that footprints carry, in [0, 1]; the rest places the
+     samples. 0 is sampling alone. (Default: :monosp:`auto`, one for a single sample per pixel,
+     falling slowly with their number)
+
+ * - emitters
+   - |string|
+   - Which emitters are asked at a hit: :monosp:`all`, that is every small one of at most 16, the
+     most powerful, and one of the others at random; or :monosp:`one` of all, at random.
+     (Default: :monosp:`all`)
+
 This is Mitsuba's :monosp:`path` (BSDF and emitter sampling, combined by multiple
 importance sampling), with one addition: the surface interaction that it hands to a BSDF carries
 the UV partials ``duv_dx`` and ``duv_dy`` of the pixel, at *every* hit. Glint BSDFs average their
@@ -31,19 +43,38 @@ normals over this footprint. The stock integrators leave the partials at zero in
 variants, and a glint BSDF then has to fall back to the cone of its ``pixel_spread`` parameter,
 which knows the distance to the last hit only.
 
-At the first hit the partials come from the sensor's ray differentials (scaled by
-:math:`1/\sqrt{\mathrm{spp}}`, as everywhere in Mitsuba). Beyond it they come from a ray cone with
-an elliptical cross-section: it grows with distance, changes at each bounce by the curvature of the
-surface and the index of refraction :cite:`Igehy1999`, and is widened by the lobe that the next
-direction was sampled from. A direction of density :math:`p` stands for the solid angle
-:math:`1/(p\,\mathrm{spp})` :cite:`Suykens2001`; smooth mirrors and glass widen nothing. What a
-mirror shows is thus filtered as sharply as its image, and what a rough surface shows is filtered
+At the first hit the partials come from the sensor's ray differentials. Beyond it they come from a
+ray cone with an elliptical cross-section: it grows with distance, changes at each bounce by the
+curvature of the surface and the index of refraction :cite:`Igehy1999`, and is widened by the lobe
+that the next direction was sampled from. A direction of density :math:`p` stands for the solid
+angle :math:`1/(p\,\mathrm{spp})` :cite:`Suykens2001`; smooth mirrors and glass widen nothing. What
+a mirror shows is thus filtered as sharply as its image, and what a rough surface shows is filtered
 as broadly as its lobe :cite:`AkenineMoller2021`. Sensors without ray differentials start with a
 cone of no width.
 
 For scenes without glint BSDFs (or other BSDFs that read UV partials) the image is that of
 ``path``, sample by sample. Participating media are not handled, and only JIT variants are
 supported. The partials are treated as constants when the rendering is differentiated.
+
+**The pixel's filter is shared.** The value of a pixel is the image filtered by the film's
+reconstruction filter, of variance Σ. Footprints filter what they cover, and so a share
+:math:`a` of Σ is theirs; samples are drawn from the filter itself, contracted by
+:math:`\sqrt{1 - a}` towards the pixel's centre, and count in this pixel only :cite:`Ernst2006`.
+Variances add: with Mitsuba's default, a Gaussian, the two together are the filter, whatever
+:math:`a` is; of other filters mean and variance are kept. Scaling footprints by
+:math:`1/\sqrt{\mathrm{spp}}` instead, as Mitsuba does with ray differentials, covers the pixel by
+chance, and the error hardly falls with the number of samples. As a footprint takes the surface for
+flat and its UV coordinates for affine, :monosp:`auto` lets :math:`a` fall slowly with the number of
+samples of the whole image, in however many passes it is rendered: the image is consistent.
+
+That needs the film to be an :monosp:`hdrfilm` and the filter to have a positive variance, which
+:monosp:`catmullrom` and :monosp:`lanczos` do not have; otherwise, and inside other integrators such
+as :monosp:`aov`, footprints are scaled by :math:`1/\sqrt{\mathrm{spp}}`. So are those of
+derivatives, which Mitsuba renders by itself.
+
+**Every small light is asked at every hit**, as to choose one is noise that glints make large.
+Environments are not small; one emitter of all those that are not asked is chosen in proportion to
+its ``sampling_weight``.
 
 **Separated illumination.** Light that has been scattered before it arrives comes from everywhere,
 and what glints add to its reflection is noise rather than something to see. With
@@ -84,29 +115,111 @@ the glints. In BSDFs of one's own: see ``glintbsdf.bridge.separation``.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.bridge import filter_sampling
+from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.bridge.separation import smooth_context
-from glintbsdf.core.errors import check
+from glintbsdf.core.errors import check, check_choice
+from glintbsdf.footprint.pixel_filter import (
+    LEAST_VARIANCE,
+    PIXEL_SIGMA,
+    PixelFilter,
+    automatic_share,
+)
 from glintbsdf.footprint.raycone import RayCone, curved_interaction, lobe_width
+from glintbsdf.lights.small import SmallLights
 
 
 class GlintPathIntegrator(mi.SamplingIntegrator):
     """``path`` with a footprint at every hit; documentation in the module's docstring."""
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)  # reads hide_emitters
+        super().__init__(props)  # reads hide_emitters and samples_per_pass
         separate = props.get("separate", False)
         max_depth = props.get("max_depth", -1)
         rr_depth = props.get("rr_depth", 5)
+        pixel_share = props.get("pixel_share", "auto")
+        emitters = props.get("emitters", "all")
         owner = props.plugin_name()
         check(max_depth >= -1, owner, "max_depth", "-1 (infinite) or a value >= 0", max_depth)
         check(rr_depth > 0, owner, "rr_depth", "greater than zero", rr_depth)
         check(isinstance(separate, bool), owner, "separate", "true or false", separate)
+        check_share(owner, "pixel_share", pixel_share)
+        check_choice(owner, "emitters", emitters, ("all", "one"))
         self.separate = separate
         self.max_depth = max_depth if max_depth >= 0 else 0xFFFFFFFF
         self.rr_depth = rr_depth
+        self.pixel_share, self.emitters = pixel_share, emitters
+        self.pixels_per_differential = None
+
+    # ------------------------------------------------------------------------------------------
+    #  The pixel's filter
+    # ------------------------------------------------------------------------------------------
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int | mi.UInt32 = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render as every integrator of Mitsuba does, with samples drawn from the film's filter."""
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        film, sampler = sensor.film(), sensor.sampler().clone()
+        if spp:
+            sampler.set_sample_count(spp)
+        with self.sharing(scene, film, sampler.sample_count()) as shared:
+            if shared is None:
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            filter_sampling.render(self, scene, sensor, shared, seed, spp)
+            film.schedule_storage()
+            image = film.develop() if develop else mi.TensorXf()
+            if evaluate:
+                dr.eval(image)
+            return image
+
+    @contextmanager
+    def sharing(
+        self, scene: mi.Scene, film: mi.Film, samples: int
+    ) -> Iterator[SharedFilter | None]:
+        """In the block, footprints carry their share of the filter of ``film``, for an image of so
+        many ``samples`` per pixel.
+
+        Yields how samples are to be placed; None where they are not to be drawn from the filter:
+        on films other than ``hdrfilm``, with filters whose variance is not positive, and, unless
+        ``pixel_share`` is a number, in scenes without footprints.
+        """
+        pixel_filter = PixelFilter(film.rfilter())
+        automatic = self.pixel_share == "auto"
+        able = film.class_name() == "HDRFilm" and pixel_filter.variance > LEAST_VARIANCE
+        if not able or (automatic and not has_footprints(scene)):
+            yield None
+            return
+        share = automatic_share(samples) if automatic else self.pixel_share
+        self.pixels_per_differential = (share * pixel_filter.variance) ** 0.5 / PIXEL_SIGMA
+        try:
+            yield SharedFilter(pixel_filter, (1 - share) ** 0.5)
+        finally:
+            self.pixels_per_differential = None
+
+    def sized(self, ray: mi.RayDifferential3f, samples: int) -> mi.RayDifferential3f:
+        """The sensor's ray, with differentials of the size that footprints are to have. They come
+        scaled by 1/√samples, as everywhere in Mitsuba."""
+        if not ray.has_differentials or self.pixels_per_differential is None:
+            return ray
+        sized = mi.RayDifferential3f(mi.Ray3f(ray))
+        sized.o_x, sized.o_y, sized.d_x, sized.d_y = ray.o_x, ray.o_y, ray.d_x, ray.d_y
+        sized.has_differentials = True
+        sized.scale_differential(dr.opaque(mi.Float, self.pixels_per_differential * samples**0.5))
+        return sized
 
     @dr.syntax
     def sample(
@@ -121,6 +234,10 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         or direct and indirect light."""
         if dr.hint(self.max_depth == 0, mode="scalar"):
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
+
+        lights = SmallLights(scene, self.emitters == "all" and has_footprints(scene))
+        ray_ = self.sized(ray_, sampler.sample_count())
+        samples = dr.opaque(mi.Float, sampler.sample_count())
 
         # --------------------- Configure loop state ----------------------
 
@@ -157,13 +274,18 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             pi[skip] = self.skip_area_emitters(scene, si_skip.spawn_ray(ray.d), True, skip)
 
         # As part of the loop's state, the sensor's ray would lose its flag has_differentials
-        while dr.hint(active, max_iterations=self.max_depth, exclude=[ray_], label="glint_path"):
+        while dr.hint(
+            active,
+            max_iterations=self.max_depth,
+            exclude=[ray_, lights, samples],
+            label="glint_path",
+        ):
             # The curvature of the surface is what bends ray cones
             si = curved_interaction(pi, ray)
 
             # ---------------------- Direct emission ----------------------
 
-            emitted = emission(scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev)
+            emitted = emission(lights, scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev)
             if dr.hint(self.separate, mode="scalar"):
                 L_direct[seen] = spectrum_fma(β, emitted, L_direct)
                 L[~seen] = spectrum_fma(β, emitted, L)
@@ -191,41 +313,32 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             # ---------------------- Emitter sampling ----------------------
 
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
-            active_em &= ds.pdf != 0
+            if dr.hint(self.separate, mode="scalar"):
+                lit = direct_light(
+                    lights,
+                    scene,
+                    sampler,
+                    si,
+                    bsdf,
+                    [(bsdf_ctx, active_em & ~seen), (glint_ctx, active_em & seen)],
+                )
+                L = spectrum_fma(β, lit[0], L)
+                L_direct = spectrum_fma(β, lit[1], L_direct)
+            else:
+                lit = direct_light(lights, scene, sampler, si, bsdf, [(bsdf_ctx, active_em)])
+                L = spectrum_fma(β, lit[0], L)
 
-            # Recompute the contribution with AD to enable light source optimization
-            if dr.hint(dr.grad_enabled(si.p), mode="scalar"):
-                ds.d = dr.normalize(ds.p - si.p)
-                em_value = scene.eval_emitter_direction(si, ds, active_em)
-                em_weight = dr.select(ds.pdf != 0, em_value / ds.pdf, 0)
-
-            wo = si.to_local(ds.d)
-
-            # ------ Evaluate BSDF * cos(theta) and sample a direction ------
+            # ---------------------- BSDF sampling ----------------------
 
             sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-            bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
-                bsdf_ctx, si, wo, sample_1, sample_2
-            )
-            bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
-            mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
-            if dr.hint(self.separate, mode="scalar"):
-                L[active_em & ~seen] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
-            else:
-                L[active_em] = spectrum_fma(β, bsdf_value * em_weight * mis_em, L)
+            bs, bsdf_weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next)
             ray_next, bsdf_weight = scatter(bsdf, bsdf_ctx, si, bs, bsdf_weight, active)
 
             # ----------- Glints in direct light (separate) -----------
 
             if dr.hint(self.separate, mode="scalar"):
                 glints = active_next & seen
-                value, pdf, bs_glint, weight = bsdf.eval_pdf_sample(
-                    glint_ctx, si, wo, sample_1, sample_2, glints
-                )
-                value = si.to_world_mueller(value, -wo, si.wi)
-                mis_em = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-                L_direct[active_em & seen] = spectrum_fma(β, value * em_weight * mis_em, L_direct)
+                bs_glint, weight = bsdf.sample(glint_ctx, si, sample_1, sample_2, glints)
 
                 # Look for an emitter in the direction of a glint. What mirrors, glass and null
                 # interfaces show is found by the path itself, which goes on along them.
@@ -233,7 +346,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 ray_glint, weight = scatter(bsdf, glint_ctx, si, bs_glint, weight, glints)
                 si_glint = scene.ray_intersect(ray_glint, glints)
                 pdf = dr.select(glints, bs_glint.pdf, 0)
-                emitted = emission(scene, si_glint, si, pdf, mi.Bool(False))
+                emitted = emission(lights, scene, si_glint, si, pdf, mi.Bool(False))
                 L_direct[glints] = spectrum_fma(β, weight * emitted, L_direct)
 
                 # A smooth lobe continues the path: emitters that it meets next are not counted
@@ -252,7 +365,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             with dr.suspend_grad():
                 # Mirrors, smooth glass and null interfaces have a discrete density, and no width
                 smooth = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
-                spread = dr.select(smooth, lobe_width(bs.pdf, sampler.sample_count()), 0)
+                spread = dr.select(smooth, lobe_width(bs.pdf, samples), 0)
                 cone = cone.scattered(si, ray.d, ray_next.d, bs.eta, spread)
 
             ray = ray_next
@@ -294,7 +407,114 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         )
 
 
+def check_share(owner: str, name: str, value: object) -> None:
+    """Raise :class:`~.ParameterError` unless ``value`` is a share."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    check(
+        value == "auto" or (number and 0 <= value <= 1),
+        owner,
+        name,
+        "auto or a number in [0, 1]",
+        value,
+    )
+
+
+def has_footprints(scene: mi.Scene) -> bool:
+    """Whether any BSDF of the scene averages over a footprint."""
+    return any(key.endswith("footprint_sigma") for key in mi.traverse(scene).keys())
+
+
+def direct_light(
+    lights: SmallLights,
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    lobes: list[tuple[mi.BSDFContext, mi.Bool]],
+) -> list[mi.Spectrum]:
+    """What ``bsdf`` reflects of the light that comes straight from emitters: from each one that is
+    asked at every hit, and from one of the others; for each of the ``lobes``, that is a context and
+    the lanes in which it is wanted."""
+    active = lobes[0][1]
+    for _, wanted in lobes[1:]:
+        active = active | wanted
+
+    def of_sample(ds, weight):
+        return [
+            reflected(scene, si, bsdf, ctx, ds, weight, wanted & active) for ctx, wanted in lobes
+        ]
+
+    if lights.asked_count == 0:
+        return of_sample(*scene.sample_emitter_direction(si, sampler.next_2d(), False, active))
+    L = light_of_all(lights, sampler, si, len(lobes), active, of_sample)
+    if lights.others_count > 0:
+        emitter, probability, random = lights.choose(sampler.next_2d(), active)
+        ds, weight = emitter.sample_direction(si, random, active)
+        ds.emitter = emitter
+        ds.pdf *= probability
+        of_other = of_sample(ds, weight * dr.rcp(probability))
+        L = [a + b for a, b in zip(L, of_other, strict=True)]
+    return L
+
+
+def light_of_all(
+    lights: SmallLights,
+    sampler: mi.Sampler,
+    si: mi.SurfaceInteraction3f,
+    count: int,
+    active: mi.Bool,
+    of_sample: Callable[[mi.DirectionSample3f, mi.Spectrum], list[mi.Spectrum]],
+) -> list[mi.Spectrum]:
+    """The part of :func:`direct_light` that comes from emitters asked at every hit."""
+    end = dr.opaque(mi.UInt32, lights.asked_count)
+
+    def ask(k, sampler, L):
+        emitter = dr.gather(mi.EmitterPtr, lights.asked, k, active)
+        ds, weight = emitter.sample_direction(si, sampler.next_2d(), active)
+        ds.emitter = emitter
+        return k + 1, sampler, [a + b for a, b in zip(L, of_sample(ds, weight), strict=True)]
+
+    state = mi.UInt32(0), sampler, [mi.Spectrum(0) for _ in range(count)]
+    return dr.while_loop(
+        state,
+        lambda k, sampler, L: active & (k < end),
+        ask,
+        max_iterations=-1,
+        label="emitters",
+    )[2]
+
+
+def reflected(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    ctx: mi.BSDFContext,
+    ds: mi.DirectionSample3f,
+    weight: mi.Spectrum,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """What ``bsdf`` reflects of one sample ``ds`` of an emitter: weighed against the chance that
+    BSDF sampling would have found it, and zero where something is in between."""
+    active = active & (ds.pdf != 0)
+
+    # Recompute the contribution with AD to enable light source optimization
+    if dr.grad_enabled(si.p):
+        ds.d = dr.normalize(ds.p - si.p)
+        weight = dr.select(ds.pdf != 0, scene.eval_emitter_direction(si, ds, active) / ds.pdf, 0)
+
+    wo = si.to_local(ds.d)
+    value, pdf = bsdf.eval_pdf(ctx, si, wo, active)
+    value = si.to_world_mueller(value, -wo, si.wi)
+    value = value * weight * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+    if not dr.grad_enabled(value):
+        # Most places of a map reflect nothing of a light. (A reversed loop cannot have this mask.)
+        active = active & (dr.max(mi.unpolarized_spectrum(value)) != 0)
+    hidden = scene.ray_test(dr.detach(si.spawn_ray_to(ds.p)), active)
+    return dr.select(active & ~hidden, value, 0)
+
+
 def emission(
+    lights: SmallLights,
     scene: mi.Scene,
     si: mi.SurfaceInteraction3f,
     si_prev: mi.Interaction3f,
@@ -305,7 +525,7 @@ def emission(
     ``pdf_prev`` has found it: weighed against the chance that emitter sampling would have. Zero
     where the density is zero."""
     ds = mi.DirectionSample3f(scene, si, si_prev)
-    em_pdf = scene.pdf_emitter_direction(si_prev, ds, ~delta_prev)
+    em_pdf = lights.pdf_direction(scene, si_prev, ds, ~delta_prev)
     return ds.emitter.eval(si, pdf_prev > 0) * mis_weight(pdf_prev, em_pdf)
 
 

@@ -71,8 +71,11 @@ def survey(inspected: Inspected, spp: int | None = None) -> list[Domain | None]:
     for bsdf, recorder in zip(inspected.bsdfs, recorders, strict=True):
         bsdf.watch = recorder
     try:
-        with rendering.footprints(scene, sensor, spp):
-            passes.sums_of_samples(scene, sensor, scene.integrator(), film, few, spp, SEED)
+        with (
+            rendering.sharing(scene, sensor, spp) as shared,
+            rendering.footprints(scene, sensor, spp),
+        ):
+            passes.sums_of_samples(scene, sensor, scene.integrator(), film, few, spp, SEED, shared)
         return [recorder and recorder.found() for recorder in recorders]
     finally:
         for bsdf in inspected.bsdfs:

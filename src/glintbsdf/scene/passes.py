@@ -19,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.bridge.filter_sampling import SharedFilter, colours
+
 
 @dataclass(frozen=True)
 class Tile:
@@ -67,6 +69,7 @@ def sums_of_samples(
     spp: int,
     total: int,
     seed: int,
+    shared: SharedFilter | None = None,
 ) -> tuple[Tile, np.ndarray]:
     """Take ``spp`` samples in each pixel of ``tile`` and add them up.
 
@@ -75,6 +78,7 @@ def sums_of_samples(
         spp: samples per pixel of this pass.
         total: samples per pixel of the image, by which footprints are scaled.
         seed: of the sensor's sampler.
+        shared: places samples by the film's filter, which then does not spread them.
 
     Returns:
         The tile widened by the reach of the film's filter, within its crop window, and its sums:
@@ -92,30 +96,48 @@ def sums_of_samples(
             sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, tile.pixels * spp)
 
-        ray, weight, position = _camera_rays(sensor, sampler, tile, spp)
+        ray, weight, position, sign = _camera_rays(sensor, sampler, tile, spp, shared, seed)
         ray.scale_differential(1 / total**0.5)
         radiance, valid, aovs = _sample(integrator, scene, sensor, sampler, ray)
-        channels = _channels(film, radiance * weight, valid, aovs, ray.wavelengths)
+        if shared is None:
+            channels = _channels(film, radiance * weight, valid, aovs, ray.wavelengths)
+            border = reach(film)
+        else:
+            values = colours(film, radiance * weight, valid, ray.wavelengths)
+            channels, border = shared.weighed(sign, values, aovs), 0
         offset = position - mi.Vector2f(dr.floor(position))
         dr.eval(channels, offset)
         del ray, weight, radiance, valid, aovs, sampler, position
-        target = tile.widened(reach(film), whole(film))
-        return target, _sums(channels, offset, film, tile, target, spp)
+        target = tile.widened(border, whole(film))
+        return target, _sums(channels, offset, film.rfilter(), border, tile, target, spp)
 
 
 def _camera_rays(
-    sensor: mi.Sensor, sampler: mi.Sampler, tile: Tile, spp: int
-) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f]:
-    """Rays through the pixels of a tile, their weights, and where they cross the film (pixels).
+    sensor: mi.Sensor,
+    sampler: mi.Sampler,
+    tile: Tile,
+    spp: int,
+    shared: SharedFilter | None,
+    seed: int,
+) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, mi.Float]:
+    """Rays through the pixels of a tile, their weights, where they cross the film (pixels), and the
+    signs with which they count.
 
     The samples of a pixel follow each other. Random numbers are drawn in Mitsuba's order.
     """
     film = sensor.film()
-    pixel = dr.arange(mi.UInt32, tile.pixels * spp) // dr.opaque(mi.UInt32, spp)
+    number, per_pixel = dr.arange(mi.UInt32, tile.pixels * spp), dr.opaque(mi.UInt32, spp)
+    pixel = number // per_pixel
     row = pixel // dr.opaque(mi.UInt32, tile.width)
     column = pixel - row * dr.opaque(mi.UInt32, tile.width)
-    corner = mi.Point2f(dr.opaque(mi.Float, tile.x), dr.opaque(mi.Float, tile.y))
-    position = mi.Point2f(mi.Float(column), mi.Float(row)) + corner + sampler.next_2d()
+    x, y = column + dr.opaque(mi.UInt32, tile.x), row + dr.opaque(mi.UInt32, tile.y)
+    if shared is None:
+        place, sign = sampler.next_2d(), mi.Float(1)
+    else:
+        order = number - pixel * per_pixel
+        place, sign = shared.place(sampler, x, y, order, dr.opaque(mi.UInt32, seed))
+        place = place + 0.5
+    position = mi.Point2f(mi.Float(x), mi.Float(y)) + place
 
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
@@ -129,7 +151,7 @@ def _camera_rays(
         sample2=(position - mi.ScalarVector2f(film.crop_offset())) * scale,
         sample3=aperture,
     )
-    return ray, weight, position
+    return ray, weight, position, sign
 
 
 def _sample(
@@ -166,24 +188,20 @@ def _channels(
     wavelengths: mi.Color0f,
 ) -> list[mi.Float]:
     """What a film stores of samples of weight one."""
-    if mi.is_polarized:
-        radiance = mi.unpolarized_spectrum(radiance)
-    alpha = dr.select(valid, mi.Float(1), mi.Float(0))
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        if mi.is_polarized:
+            radiance = mi.unpolarized_spectrum(radiance)
+        alpha = dr.select(valid, mi.Float(1), mi.Float(0))
         count = film.create_block().channel_count()
         return film.prepare_sample(radiance, wavelengths, count, weight=1.0, alpha=alpha)
-    if mi.is_spectral:
-        colour = mi.spectrum_to_srgb(radiance, wavelengths)
-    else:
-        colour = mi.Color3f(radiance.x) if mi.is_monochromatic else radiance
-    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-    return [*colour, *([alpha] if has_alpha else []), mi.Float(1), *aovs]
+    return [*colours(film, radiance, valid, wavelengths), mi.Float(1), *aovs]
 
 
 def _sums(
     channels: list[mi.Float],
     offset: mi.Point2f,
-    film: mi.Film,
+    rfilter: mi.ReconstructionFilter,
+    border: int,
     tile: Tile,
     target: Tile,
     spp: int,
@@ -193,6 +211,7 @@ def _sums(
     Args:
         channels: of all samples of ``tile``, evaluated; those of a pixel follow each other.
         offset: position of each sample in its pixel, in [0, 1]².
+        rfilter, border: the filter that spreads samples, over so many pixels on each side.
     """
     count = len(channels)
     width = dr.opaque(mi.UInt32, target.width)
@@ -203,7 +222,6 @@ def _sums(
     y = mi.Int32(row) + dr.opaque(mi.Int32, target.y - tile.y)
     columns, rows = dr.opaque(mi.Int32, tile.width), dr.opaque(mi.Int32, tile.height)
     per_pixel = dr.opaque(mi.UInt32, spp)
-    border, rfilter = reach(film), film.rfilter()
     values = [mi.Float64(0) for _ in range(count)]
     across = dr.opaque(mi.Int32, 2 * border + 1)
     last = across * across

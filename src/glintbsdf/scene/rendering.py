@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.scene import passes
 from glintbsdf.scene.denoising import denoised, guided
@@ -147,6 +148,21 @@ def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
         parameters.update()
 
 
+@contextmanager
+def sharing(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[SharedFilter | None]:
+    """In the block, the scene's ``glint_path``, if that is its integrator, gives footprints their
+    share of the pixel's filter, for an image of ``spp`` samples per pixel in whatever passes.
+
+    Yields how samples are to be placed then; None for any other integrator.
+    """
+    integrator = scene.integrator()
+    if not hasattr(integrator, "sharing"):
+        yield None
+        return
+    with integrator.sharing(scene, sensor.film(), spp) as shared:
+        yield shared
+
+
 # ---------------------------------------------------------------------------------------------
 #  Image
 # ---------------------------------------------------------------------------------------------
@@ -187,6 +203,7 @@ class Renderer:
         self._stack = ExitStack()
 
     def __enter__(self) -> Renderer:
+        self.shared = self._stack.enter_context(sharing(self.scene, self.sensor, self.spp))
         if self.denoise:
             self.integrator = self._stack.enter_context(guided(self.integrator))
         self._stack.enter_context(footprints(self.scene, self.sensor, self.spp))
@@ -208,7 +225,14 @@ class Renderer:
         """
         while True:
             result = passes.sums_of_samples(
-                self.scene, self.sensor, self.integrator, unit.tile, unit.spp, self.spp, unit.seed
+                self.scene,
+                self.sensor,
+                self.integrator,
+                unit.tile,
+                unit.spp,
+                self.spp,
+                unit.seed,
+                self.shared,
             )
             if not self.missed():
                 return result

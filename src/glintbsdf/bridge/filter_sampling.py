@@ -1,0 +1,171 @@
+"""Rendering whose samples are drawn from the film's filter rather than spread by it.
+
+Mitsuba's integrators draw samples all over the image, and each counts in the pixels around it by
+the film's filter. Here each sample belongs to one pixel, and lies about its centre with the filter
+as its density, contracted perhaps: see :mod:`~glintbsdf.footprint.pixel_filter`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.footprint.pixel_filter import PixelFilter
+
+#: A wavefront's samples are counted in 32 bits.
+LARGEST_WAVEFRONT = 2**32 - 1
+
+#: Steps of Roberts's two-dimensional low-discrepancy sequence: the powers of 1/ρ, ρ³ = ρ + 1.
+LATTICE_STEPS = 0.7548776662466927, 0.5698402909980532
+
+
+@dataclass(frozen=True)
+class SharedFilter:
+    """A film's filter, a share of which footprints carry.
+
+    Attributes:
+        pixel_filter (PixelFilter): of the film.
+        contraction (float): factor on the samples' offsets from their pixel's centre, in [0, 1].
+    """
+
+    pixel_filter: PixelFilter
+    contraction: float
+
+    def place(
+        self, sampler: mi.Sampler, x: mi.UInt32, y: mi.UInt32, order: mi.UInt32, seed: mi.UInt32
+    ) -> tuple[mi.Vector2f, mi.Float]:
+        """Where the sample numbered ``order`` of the pixel (``x``, ``y``) lies: its offset from the
+        pixel's centre (pixels), and the sign of its weight.
+
+        Samplers that stratify the samples of a pixel are asked; in place of independent numbers
+        comes a low-discrepancy sequence.
+        """
+        if sampler.class_name() == "IndependentSampler":
+            random = lattice_point(order, x, y, seed)
+        else:
+            random = sampler.next_2d()
+        offset, sign = self.pixel_filter.sample(random)
+        return offset * dr.opaque(mi.Float, self.contraction), sign
+
+    def weighed(
+        self, sign: mi.Float, values: list[mi.Float], aovs: list[mi.Float]
+    ) -> list[mi.Float]:
+        """What a film stores of a sample: ``values`` and ``aovs`` with its sign, and its weight
+        between the two."""
+        if self.pixel_filter.positive:
+            return [*values, mi.Float(1), *aovs]
+        weight = mi.Float(self.pixel_filter.weight**2)
+        return [*(sign * v for v in values), weight, *(sign * v for v in aovs)]
+
+
+def render(
+    integrator: mi.SamplingIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    shared: SharedFilter,
+    seed: int | mi.UInt32 = 0,
+    spp: int = 0,
+    largest: int = LARGEST_WAVEFRONT,
+) -> None:
+    """Render into the film of ``sensor``, which must be an ``hdrfilm``.
+
+    Args:
+        integrator: any; its ``sample`` gets differentials scaled by 1/√spp, as from Mitsuba.
+        spp: samples per pixel; 0 for the sampler's own number.
+        largest: samples that may be under way at the same time; more are drawn in several passes.
+    """
+    film = sensor.film()
+    sampler = sensor.sampler().clone()
+    if spp:
+        sampler.set_sample_count(spp)
+    spp = sampler.sample_count()
+    size = film.crop_size()
+    pixels = int(np.prod(size))
+    passes = next(n for n in range(1, spp + 1) if spp % n == 0 and spp // n * pixels <= largest)
+    per_pass = spp // passes
+    sampler.set_samples_per_wavefront(per_pass)
+    sampler.seed(seed, per_pass * pixels)
+
+    film.prepare(integrator.aov_names())
+    block = mi.ImageBlock(size, film.crop_offset(), film.create_block().channel_count())
+    block.set_coalesce(block.coalesce() and per_pass >= 4)
+    for index in range(passes):
+        add_samples(integrator, scene, sensor, shared, seed, sampler, per_pass, index, block)
+        if passes > 1:
+            sampler.advance()
+            sampler.schedule_state()
+            dr.eval(block.tensor())
+    film.put_block(block)
+
+
+def add_samples(
+    integrator: mi.SamplingIntegrator,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    shared: SharedFilter,
+    seed: int | mi.UInt32,
+    sampler: mi.Sampler,
+    per_pass: int,
+    index: int,
+    block: mi.ImageBlock,
+) -> None:
+    """Add to ``block`` the pass numbered ``index``, of ``per_pass`` samples in each pixel."""
+    film = sensor.film()
+    size, offset = film.crop_size(), film.crop_offset()
+    number = dr.arange(mi.UInt32, per_pass * int(np.prod(size)))
+    per_pixel, width = dr.opaque(mi.UInt32, per_pass), dr.opaque(mi.UInt32, size[0])
+    pixel = number // per_pixel
+    row = pixel // width
+    column = pixel - row * width
+    order = number - pixel * per_pixel + dr.opaque(mi.UInt32, index * per_pass)
+    x, y = (i + dr.opaque(mi.UInt32, o) for i, o in zip((column, row), offset, strict=True))
+    jitter, sign = shared.place(sampler, x, y, order, mi.UInt32(seed))
+    place = (mi.Point2f(column, row) + 0.5 + jitter) * dr.rcp(mi.ScalarVector2f(size))
+
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time = time + sampler.next_1d() * sensor.shutter_open_time()
+    wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+    ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
+    if ray.has_differentials:
+        ray.scale_differential(dr.rsqrt(dr.opaque(mi.Float, sampler.sample_count())))
+
+    radiance, valid, aovs = integrator.sample(scene, sampler, ray, sensor.get_medium(), True)
+    values = colours(film, weight * radiance, valid, ray.wavelengths)
+    block.put(mi.Point2f(x, y) + 0.5, shared.weighed(sign, values, aovs))
+
+
+def colours(
+    film: mi.Film, radiance: mi.Spectrum, valid: mi.Bool, wavelengths: mi.Color0f
+) -> list[mi.Float]:
+    """The colours that an ``hdrfilm`` stores of a sample, and its alpha if there is any."""
+    if mi.is_polarized:
+        radiance = mi.unpolarized_spectrum(radiance)
+    if mi.is_spectral:
+        radiance = mi.spectrum_to_srgb(radiance, wavelengths)
+    elif mi.is_monochromatic:
+        radiance = mi.Color3f(radiance.x)
+    alpha = [dr.select(valid, mi.Float(1), mi.Float(0))]
+    return [*radiance, *(alpha if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else [])]
+
+
+def lattice_point(order: mi.UInt32, x: mi.UInt32, y: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
+    """A point of the unit square: number ``order`` of an additive recurrence, all points of a pixel
+    shifted by the same random vector. Each point alone is uniformly distributed.
+
+    Source: Cranley and Patterson, "Randomization of Number Theoretic Methods for Multiple
+    Integration", SIAM J. Numer. Anal. 13(6), 1976; Roberts, "The Unreasonable Effectiveness of
+    Quasirandom Sequences", 2018. In integers, where the sum wraps around and keeps all its digits.
+    """
+    shifts = pcg3d(x, y, seed)
+    return mi.Point2f(
+        *(
+            uniform(shift + order * round(step * 2**32))
+            for shift, step in zip(shifts, LATTICE_STEPS, strict=False)
+        )
+    )

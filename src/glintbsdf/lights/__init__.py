@@ -1,0 +1,1 @@
+"""What of a scene's lights is integrated rather than sampled."""

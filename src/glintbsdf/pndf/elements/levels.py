@@ -1,0 +1,333 @@
+"""Coarse elements: a map's Gaussian elements, merged level by level, for spread normals.
+
+Where a light has extent, what is asked is the P-NDF averaged over a spread of normals. A wide
+spread meets nearly every element under a footprint, and needs none of them in detail. So elements
+are merged: one of level ℓ stands for a Gaussian of the map's plane about 2^ℓ texels wide, and holds
+the mean of the normals there, their regression on position and the covariance that this leaves.
+All moments up to the second are those of the merged elements, so the mean and the covariance under
+every footprint are kept.
+
+The two-scale relation of Gaussians does it: one of variance S' is a sum of those of variance S that
+stand on a lattice, weighed by a Gaussian of variance S' − S. The elements of the level below, mean
+s, regression J, residual covariance Q, become a mixture whose raw moments about their common place
+are sums: of s, of J S + s dᵀ, and of Q + J S Jᵀ + s sᵀ, d the way from the merged place to theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, sqrt
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf.footprint.kernels import TexelKernel
+from glintbsdf.footprint.lattice import floor_int
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap
+
+#: Squared Mahalanobis distance from the footprint's centre at which elements are cut, and the width
+#: over which they fade until there.
+CUT, FADE = 8.0, 2.0
+
+#: Cells that a footprint's minor standard deviation spans, about, at the level it is asked at.
+CELLS = 2.0
+
+#: Standard deviation of a cell's normals over that of the spread, about, at the level asked.
+DETAIL = 1.0
+
+#: Taps of the merging Gaussian on each side of its centre, in its standard deviations.
+TAPS = 4.0
+
+#: Standard deviations beyond the map's normals where nothing is left.
+REACH = 4.5
+
+NUMBERS = 9  # of an element: mean 2, Jacobian 4, residual covariance 3
+
+
+@dataclass
+class Raw:
+    """Raw moments of the elements of a level, about their own places (arrays of rows × columns).
+
+    Attributes:
+        n (list of 2): means.
+        nx, ny (lists of 2): of normal times offset along x and y, texels.
+        nn (list of 3): of products, xx, xy, yy.
+        counts, spacing (pairs, x first): elements along each axis, and texels between them.
+    """
+
+    n: list
+    nx: list
+    ny: list
+    nn: list
+    counts: tuple[int, int]
+    spacing: tuple[float, float]
+
+
+class Levels:
+    """The coarse elements of a map, levels 1 and up, each stored as :data:`NUMBERS` floats.
+
+    Args:
+        data (mi.TensorXf): projected normals, H×W×2; derivatives flow through it.
+        wrap_mode (str): what lies beyond the map.
+
+    Attributes:
+        slope (float): standard deviation of the normals within a texel's Gaussian, over the map.
+        lower, upper (mi.Vector2f): bounds of the map's normals.
+        nbytes (int): memory, bytes.
+    """
+
+    def __init__(self, data: mi.TensorXf, wrap_mode: str) -> None:
+        height, width, _ = data.shape
+        self.wrap_mode = wrap_mode
+        base = texels(data, wrap_mode)
+        variance = sum(dr.mean(x * x + y * y) for x, y in (base.nx, base.ny))
+        self.slope = max(float(np.sqrt(variance[0])) / SIGMA_H, 1e-12)
+        x, y = base.n
+        self.lower, self.upper = (
+            mi.Vector2f(dr.detach(extreme(x)), dr.detach(extreme(y)))
+            for extreme in (dr.min, dr.max)
+        )
+
+        tables, sizes, offsets, raw = [], [], [], base
+        while not tables or max(raw.counts) > 1:
+            if tables:
+                raw = merged(merged(raw, 0, wrap_mode), 1, wrap_mode)
+            offsets.append(sum(len(t) for t in tables) // NUMBERS)
+            tables.append(central(raw))
+            sizes.append(raw.counts)
+        self.count = len(tables)
+        self.table = dr.concat(tables) if self.count > 1 else tables[0]
+        self.columns = mi.Int([size[0] for size in sizes])
+        self.rows = mi.Int([size[1] for size in sizes])
+        self.offsets = mi.UInt32(offsets)
+        self.texels = mi.Vector2f(width, height)
+        dr.make_opaque(self.columns, self.rows, self.offsets, self.lower, self.upper, self.texels)
+        dr.eval(self.table)
+        self.nbytes = 4 * dr.width(self.table)
+
+    def level_for(self, kernel: TexelKernel, spread: mi.Float) -> mi.UInt32:
+        """The level to ask, as an index, for a footprint (in texels) and a spread of normals, its
+        standard deviation: cells about as wide as either allows."""
+        by_footprint = dr.sqrt(kernel.minor_variance) * (1 / CELLS)
+        by_spread = spread * dr.opaque(mi.Float, DETAIL / (SIGMA_H * self.slope))
+        level = dr.round(dr.log2(dr.maximum(by_footprint, by_spread)))
+        return mi.UInt32(dr.clip(level, 0, self.count - 1))
+
+    def eval(
+        self,
+        m: mi.Vector2f,
+        footprint,
+        variance: mi.Float,
+        spread: tuple,
+        turn: mi.Matrix2f | None,
+        active: mi.Bool,
+    ) -> mi.Float:
+        """The density of the projected normal ``m``.
+
+        Args:
+            footprint: in the UV space of the map.
+            variance: of the normals of a flat place, in every direction.
+            spread: ``mi.Vector2f`` whose outer products are added to it.
+            turn: of the half vector, per UV.
+        """
+        height, width = self.texels.y, self.texels.x
+        kernel = TexelKernel("gaussian", footprint, height, width, self.wrap_mode, (0.0, 0.0))
+        rough = Gaussian(spread, variance)
+        widest = dr.sqrt(dr.maximum(rough.xx, rough.yy))
+        level = self.level_for(kernel, dr.sqrt(dr.sqrt(rough.determinant)))
+        columns = dr.gather(mi.Int, self.columns, level, active)
+        rows = dr.gather(mi.Int, self.rows, level, active)
+        offset = dr.gather(mi.UInt32, self.offsets, level, active)
+
+        size = mi.Vector2f(columns, rows)
+        variances = (SIGMA_H**2, SIGMA_H**2)
+        kernel = TexelKernel("gaussian", footprint, size.y, size.x, self.wrap_mode, variances)
+        kernel.cut_at(sqrt(CUT))
+        overlap = Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=SIGMA_H**2))
+        if turn is not None:  # per cell
+            turn = mi.Matrix2f(
+                turn[0, 0] / size.x, turn[0, 1] / size.y, turn[1, 0] / size.x, turn[1, 1] / size.y
+            )
+
+        margin = REACH * widest
+        if turn is not None:
+            # The half vector's own way over the footprint.
+            way = [dr.squared_norm(turn @ v) for v in (kernel.du, kernel.dv)]
+            margin = margin + sqrt(CUT) * dr.sqrt(way[0] + way[1])
+        active = mi.Bool(active) & dr.all((m > self.lower - margin) & (m < self.upper + margin))
+
+        mean = mi.Vector2f(kernel.mean)
+        bottom = floor_int(mean.y + kernel.reach_v)
+
+        def row(y):
+            left, right = kernel.row_at(mi.Float(y) - mean.y)
+            return -floor_int(-mean.x - left), floor_int(mean.x + right)
+
+        def body(x, right, y, active, density, mass):
+            d = mi.Vector2f(x, y) - mean
+            inside = active & (x <= right)
+            weight = dr.clip((CUT - dr.squared_norm(kernel.whitened(d))) * (1 / FADE), 0, 1)
+            weight = dr.select(inside, weight * overlap.mass(d), 0)
+            column, flip_x = self.wrapped(x, columns)
+            line, flip_y = self.wrapped(y, rows)
+            index = offset + mi.UInt32(line * columns + column)
+            e = [dr.gather(mi.Float, self.table, NUMBERS * index + k, inside) for k in range(9)]
+            jacobian = mi.Matrix2f(e[2] * flip_x, e[4] * flip_y, e[3] * flip_x, e[5] * flip_y)
+            normal = mi.Vector2f(e[0], e[1])
+            if turn is not None:
+                normal, jacobian = normal - turn @ d, jacobian - turn
+            # Q = a aᵀ + b bᵀ, and J C Jᵀ
+            residual = (mi.Vector2f(e[6], e[7]), mi.Vector2f(0, e[8]))
+            roughness = Gaussian(residual + rough.vectors, rough.variance)
+            normals = overlap.normals(jacobian, roughness)
+            delta = m - normal + jacobian @ overlap.mean(d)
+            density = dr.fma(weight, normals.eval(delta), density)
+            mass = mass + weight
+
+            done = x >= right
+            y = dr.select(done, y + 1, y)
+            left, new_right = row(y)
+            x, right = dr.select(done, left, x + 1), dr.select(done, new_right, right)
+            return x, right, y, active & (y <= bottom), density, mass
+
+        top = -floor_int(-mean.y + kernel.reach_v)
+        left, right = row(top)
+        *_, density, mass = dr.while_loop(
+            (left, right, top, active & (top <= bottom), mi.Float(0), mi.Float(0)),
+            lambda *state: state[3],
+            body,
+            max_iterations=-1,
+            label="coarse elements",
+        )
+        return density / dr.select(mass > 0, mass, 1)
+
+    def wrapped(self, index: mi.Int, count: mi.Int) -> tuple[mi.Int, mi.Float]:
+        """The element that stands at any index along an axis of ``count``, and the sign of its
+        derivatives along it."""
+        if self.wrap_mode == "clamp":
+            inside = (index >= 0) & (index < count)
+            return dr.clip(index, 0, count - 1), dr.select(inside, mi.Float(1), 0)
+        if self.wrap_mode == "repeat":
+            turns = floor_int((mi.Float(index) + 0.5) / mi.Float(count))
+            return index - turns * count, mi.Float(1)
+        turns = floor_int((mi.Float(index) + 0.5) / mi.Float(2 * count))
+        index = index - turns * 2 * count
+        beyond = index >= count
+        return dr.select(beyond, 2 * count - 1 - index, index), dr.select(beyond, mi.Float(-1), 1)
+
+
+# ------------------------------------------------------------------------------------------------
+#  Building
+# ------------------------------------------------------------------------------------------------
+
+
+def wrap(index: np.ndarray, count: int, wrap_mode: str) -> tuple[np.ndarray, np.ndarray]:
+    """The stored places that stand at ``index``, and the signs of their derivatives."""
+    if wrap_mode == "clamp":
+        return np.clip(index, 0, count - 1), np.where((index >= 0) & (index < count), 1.0, 0.0)
+    if wrap_mode == "repeat":
+        return index % count, np.ones(index.shape)
+    index = index % (2 * count)
+    beyond = index >= count
+    return np.where(beyond, 2 * count - 1 - index, index), np.where(beyond, -1.0, 1.0)
+
+
+def texels(data: mi.TensorXf, wrap_mode: str) -> Raw:
+    """Level 0: one element per texel, whose Jacobian is that of central differences."""
+    height, width, _ = data.shape
+    index = dr.arange(mi.UInt32, width * height)
+    n = [dr.gather(mi.Float, data.array, 2 * index + k) for k in (0, 1)]
+    rows, columns = np.divmod(np.arange(width * height), width)
+
+    def difference(channel, along_x):
+        places = []
+        for step in (1, -1):
+            if along_x:
+                places.append(rows * width + wrap(columns + step, width, wrap_mode)[0])
+            else:
+                places.append(wrap(rows + step, height, wrap_mode)[0] * width + columns)
+        after, before = (
+            dr.gather(mi.Float, channel, mi.UInt32(place.astype(np.uint32))) for place in places
+        )
+        return 0.5 * (after - before)
+
+    variance = SIGMA_H**2
+    jx, jy = ([difference(channel, along_x) for channel in n] for along_x in (True, False))
+    nn = [
+        n[i] * n[j] + variance * (jx[i] * jx[j] + jy[i] * jy[j])
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    ]
+    nx, ny = ([variance * j for j in js] for js in (jx, jy))
+    return Raw(n, nx, ny, nn, (width, height), (1.0, 1.0))
+
+
+def merged(raw: Raw, axis: int, wrap_mode: str) -> Raw:
+    """The elements of half as many places along an axis (0: x)."""
+    count, spacing = raw.counts[axis], raw.spacing[axis]
+    if count == 1:
+        return raw
+    new_count = ceil(count / 2)
+    ratio = count / new_count
+    variance = SIGMA_H**2 * (ratio**2 - 1)  # of the taps, in elements
+    centre = (np.arange(new_count) + 0.5) * ratio - 0.5
+    reach = ceil(TAPS * sqrt(variance))
+    offsets = np.arange(-reach, reach + 2)
+    places = np.floor(centre)[:, None].astype(int) + offsets
+    distance = places - centre[:, None]
+    weight = np.exp(-0.5 * distance**2 / variance)
+    weight /= weight.sum(1, keepdims=True)
+    stored, sign = wrap(places, count, wrap_mode)
+
+    columns, rows = raw.counts
+    new_counts = (new_count, rows) if axis == 0 else (columns, new_count)
+    index = np.arange(new_counts[0] * new_counts[1])
+    row, column = np.divmod(index, new_counts[0])
+    along = column if axis == 0 else row
+    zero = mi.Float(0)
+    n, nx, ny, nn = [zero] * 2, [zero] * 2, [zero] * 2, [zero] * 3
+    for k in range(len(offsets)):
+        place = stored[along, k]
+        source = row * columns + place if axis == 0 else place * columns + column
+        source = mi.UInt32(source.astype(np.uint32))
+        w, d, s = (
+            mi.Float(values[along, k].astype(np.float32))
+            for values in (weight, distance * spacing, sign)
+        )
+
+        def taken(channels, source=source):
+            return [dr.gather(mi.Float, channel, source) for channel in channels]
+
+        means, about_x, about_y, products = map(taken, (raw.n, raw.nx, raw.ny, raw.nn))
+        turned = about_x if axis == 0 else about_y
+        turned[:] = [t * s + d * mean for t, mean in zip(turned, means, strict=True)]
+        n, nx, ny, nn = (
+            [dr.fma(w, value, total) for value, total in zip(values, totals, strict=True)]
+            for values, totals in ((means, n), (about_x, nx), (about_y, ny), (products, nn))
+        )
+    dr.eval(n, nx, ny, nn)
+    new_spacing = spacing * ratio
+    spacings = (new_spacing, raw.spacing[1]) if axis == 0 else (raw.spacing[0], new_spacing)
+    return Raw(n, nx, ny, nn, new_counts, spacings)
+
+
+def central(raw: Raw) -> mi.Float:
+    """The numbers of each element: mean; Jacobian per cell, columns x and y; a root (a, b; 0, c) of
+    the residual covariance."""
+    (nx, ny), variance = raw.n, SIGMA_H**2
+    jx = [v * (1 / (variance * raw.spacing[0])) for v in raw.nx]
+    jy = [v * (1 / (variance * raw.spacing[1])) for v in raw.ny]
+    xx, xy, yy = (
+        product - raw.n[i] * raw.n[j] - variance * (jx[i] * jx[j] + jy[i] * jy[j])
+        for product, (i, j) in zip(raw.nn, ((0, 0), (0, 1), (1, 1)), strict=True)
+    )
+    # Rounding must not make it indefinite.
+    a = dr.sqrt(dr.maximum(xx, 1e-12))
+    b = xy / a
+    c = dr.sqrt(dr.maximum(yy - b * b, 1e-12))
+    count = raw.counts[0] * raw.counts[1]
+    table = dr.zeros(mi.Float, NUMBERS * count)
+    index = dr.arange(mi.UInt32, count)
+    for k, value in enumerate((nx, ny, jx[0], jx[1], jy[0], jy[1], a, b, c)):
+        dr.scatter(table, value, NUMBERS * index + k)
+    return table
