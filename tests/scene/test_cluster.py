@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -394,3 +395,42 @@ def test_a_killed_scheduler(job, folder, tmp_path):
         scheduler.kill()
     assert counts[0] >= 5
     assert np.array_equal(resumed, image(job, None))
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Keys:
+    """A certificate of an authority of its own, for scheduler, worker and client alike."""
+    if shutil.which("openssl") is None:
+        pytest.skip("there is no openssl to make certificates")
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    new = ("-newkey", "rsa:2048", "-nodes", "-days", "2")
+    openssl("req", "-x509", *new, "-subj", "/CN=ca", "-keyout", "ca.key", "-out", "ca.pem")
+    openssl("req", *new[:-2], "-subj", "/CN=node", "-keyout", "node.key", "-out", "node.csr")
+    openssl("x509", "-req", "-in", "node.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
+            "-CAcreateserial", "-days", "2", "-out", "node.pem")  # fmt: skip
+    return Keys(*(tmp_path / name for name in ("ca.pem", "node.pem", "node.key")))
+
+
+def test_tls(job, keys, tmp_path):
+    """The same image; who has no key, or another authority's, gets no answer."""
+    files = ("--tls-ca-file", keys.ca_file, "--tls-cert", keys.cert, "--tls-key", keys.key)
+    scheduler = Scheduler(tmp_path, *map(str, files), "--protocol", "tls", scheme="tls")
+    try:
+        with Cluster.at(scheduler.address, keys, tell=print) as cluster:
+            assert np.array_equal(image(job, cluster), image(job, None))
+        begun = time.monotonic()
+        with pytest.raises(ClusterError, match="no scheduler answers"):
+            Cluster.at(scheduler.address.replace("tls", "tcp"), tell=print).__enter__()
+        assert time.monotonic() - begun < 10
+        stranger = tmp_path / "stranger.pem"
+        subprocess.run(
+            ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=x",
+             "-keyout", "/dev/null", "-out", str(stranger)], check=True, capture_output=True,
+        )  # fmt: skip
+        with pytest.raises(ClusterError, match="no scheduler answers"):
+            Cluster.at(scheduler.address, replace(keys, ca_file=stranger), tell=print).__enter__()
+    finally:
+        scheduler.kill()

@@ -84,7 +84,7 @@ class Making:
 
 
 def _tell(message: str) -> None:
-    click.echo(f"Note: {message}.", err=True)
+    click.echo(f"Note: {message.rstrip(chr(46))}.", err=True)
 
 
 def _parse_duration(

@@ -12,6 +12,7 @@ cluster listens on loopback only; across machines use TLS.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -69,6 +70,14 @@ class ClusterError(RuntimeError):
 
 _lock = threading.RLock()  # Mitsuba's variant and Dr.Jit's threads are those of the process
 _loaded: OrderedDict[Job, tuple[Renderer, ExitStack]] = OrderedDict()
+
+
+@atexit.register
+def _forget() -> None:
+    """Let go of what is loaded, as long as there is a Mitsuba to do it."""
+    while _loaded:
+        _, (_, stack) = _loaded.popitem()
+        stack.close()
 
 
 @dataclass(frozen=True)
@@ -135,7 +144,9 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
         return _loaded[job][0]
     if job.variant not in mi.variants():
         raise ClusterError(f"a worker's Mitsuba has no variant {job.variant}")
-    while len(_loaded) >= SCENES or (_loaded and mi.variant() != job.variant):
+    if mi.variant() != job.variant:
+        _forget()
+    while len(_loaded) >= SCENES:
         _, (_, stack) = _loaded.popitem(last=False)
         stack.close()
     if job.variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
