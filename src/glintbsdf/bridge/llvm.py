@@ -11,7 +11,6 @@ best avoided.
 
 from __future__ import annotations
 
-import ctypes
 import glob
 import os
 import platform
@@ -52,21 +51,17 @@ class Library(NamedTuple):
 
 
 def choose() -> None:
-    """Name the newest usable LLVM to Dr.Jit, unless one is named or in use already.
+    """Name the newest usable LLVM to Dr.Jit, unless one is named or loaded already.
 
-    Called when the package is imported. Does nothing where no usable library is found: a program
-    that runs on the GPU needs none. :func:`require_usable` tells everybody else.
+    Called when the package is imported. Does nothing where no usable library is found, as a program
+    that runs on the GPU needs none, nor where Dr.Jit was imported before and has made its choice.
+    :func:`require_usable` tells everybody else.
     """
-    if VARIABLE in os.environ:
-        return
-    if "drjit" in sys.modules and (_jit_in_use() or _is_usable(loaded_version())):
+    if VARIABLE in os.environ or "drjit" in sys.modules:
         return
     library = next((library for library in find() if library.usable), None)
-    if library is None:
-        return
-    os.environ[VARIABLE] = library.path
-    if "drjit" in sys.modules:
-        _restart_drjit()
+    if library is not None:
+        os.environ[VARIABLE] = library.path
 
 
 def require_usable() -> None:
@@ -90,9 +85,9 @@ def require_usable() -> None:
     elif named:
         remedy = f"Before Python starts, type: export {VARIABLE}={usable.path}"
     else:
-        # Found, but too late to take its place: an LLVM variant was active before us.
+        # Found, but too late: Dr.Jit chooses its LLVM when it is imported.
         remedy = (
-            "Import glintbsdf before the first LLVM variant is chosen, or, before Python starts, "
+            "Import glintbsdf before mitsuba and drjit, or, before Python starts, "
             f"type: export {VARIABLE}={usable.path}"
         )
     raise LLVMError(f"{problem}, but version {MINIMUM_VERSION} or newer is needed. {remedy}")
@@ -124,12 +119,6 @@ def _is_usable(version: tuple[int, ...] | None) -> bool:
 # ---------------------------------------------------------------------------------------------
 #  Search
 # ---------------------------------------------------------------------------------------------
-
-
-# libLLVM-15.so.1, libLLVM-14.0.6.so, libLLVM.so.23.1, libLLVM-19.dylib; not libLLVM.so.1
-_LIBRARY_NAME = (
-    r"libLLVM(?:-(?P<before>\d[\d.]*\d|\d)\.(?:so|dylib)(?:\.\d+)?|\.so\.(?P<after>\d\d[\d.]*))"
-)
 
 
 # libLLVM-15.so.1, libLLVM-14.0.6.so, libLLVM.so.23.1, libLLVM-19.dylib
@@ -196,36 +185,3 @@ def _ask_version(path: str) -> tuple[int, ...] | None:
         [sys.executable, "-I", "-c", script, path], capture_output=True, text=True, check=False
     )
     return tuple(int(part) for part in answer.stdout.split()) or None
-
-
-# ---------------------------------------------------------------------------------------------
-#  Where Dr.Jit was imported first
-# ---------------------------------------------------------------------------------------------
-
-
-def _jit_in_use() -> bool:
-    """Tell whether a JIT variant has been loaded or a Dr.Jit array exists in this process."""
-    import drjit as dr
-
-    if any(re.match(r"mitsuba\.(llvm|cuda|metal)_", module) for module in sys.modules):
-        return True
-    return "No variables registered" not in dr.whos(as_string=True)
-
-
-def _restart_drjit() -> None:
-    """Let Dr.Jit, imported but not yet used, look for its backends once more.
-
-    Dr.Jit has no Python function for this; its C++ functions ``jit_shutdown(int)`` and
-    ``jit_init(uint32_t)`` are called by their exported names. Where these are not found, nothing
-    happens, and :func:`require_usable` explains what to do when an LLVM variant is chosen.
-    """
-    import drjit as dr
-
-    suffix = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
-    try:
-        core = ctypes.CDLL(os.path.join(os.path.dirname(dr.__file__), f"libdrjit-core{suffix}"))
-        shutdown, init = core._Z12jit_shutdowni, core._Z8jit_initj
-    except (OSError, AttributeError):
-        return
-    shutdown(ctypes.c_int(0))
-    init(ctypes.c_uint32(1 << 1 | 1 << 2 | 1 << 3))  # CUDA, LLVM, Metal

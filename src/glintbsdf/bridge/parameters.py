@@ -23,6 +23,7 @@ from math import isfinite, pi
 from pathlib import Path
 from typing import NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -337,6 +338,8 @@ class Parameters:
         requirement = f"one of {', '.join(choices)}, the name of an image file or an mi.Bitmap"
         bitmap = value
         if isinstance(value, str):
+            if dr.thread_count() < 2:  # with one, Mitsuba never returns from reading an OpenEXR
+                dr.set_thread_count(2)
             path = Path(str(mi.file_resolver().resolve(value)))
             check(is_file(path), self.owner, name, requirement, value)
             try:

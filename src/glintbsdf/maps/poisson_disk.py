@@ -16,6 +16,9 @@ import numpy.typing as npt
 #: Points per cell. Saturation, which takes many more throws, is at about 0.33.
 FILL = 0.29
 
+#: Rounds of throws, at most. At this density twenty are enough, as measured up to a million points.
+MAX_ROUNDS = 1000
+
 #: Standard deviation of the neighbourhood in which areas are balanced, in mean distances √(1/N).
 BALANCE = 1.1
 
@@ -40,7 +43,9 @@ def poisson_disk(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32
         (i, j) for i in range(-2, 3) for j in range(-2, 3) if (i, j) != (0, 0) and abs(i * j) < 4
     ]
     missing = count
-    while missing:
+    for _ in range(MAX_ROUNDS):
+        if not missing:
+            return places
         for phase in rng.permutation(9):
             row, column = (
                 v.ravel()
@@ -61,7 +66,7 @@ def poisson_disk(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32
                 hits = rng.permutation(hits)[:missing]
             places[row[hits], column[hits]] = dart[hits]
             missing -= len(hits)
-    return places
+    raise RuntimeError(f"{missing} of {count} points found no place in {MAX_ROUNDS} rounds")
 
 
 def balanced_areas(places: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

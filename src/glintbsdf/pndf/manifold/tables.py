@@ -14,7 +14,6 @@ have an entry, and how many entries come before.
 
 from __future__ import annotations
 
-import os
 from math import sqrt
 from multiprocessing.pool import ThreadPool
 from typing import TYPE_CHECKING
@@ -24,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.progress import progress
+from glintbsdf.core.tuning import usable_cores
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.pndf.manifold import table_error
 from glintbsdf.pndf.manifold.table_error import grains
@@ -60,7 +60,7 @@ STRIP_ENTRIES = 8e6
 CHUNK = 1 << 19
 
 #: Threads for what NumPy and SciPy do.
-THREADS = os.cpu_count() or 1
+THREADS = usable_cores()
 
 
 # ------------------------------------------------------------------------------------------------
