@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,8 @@ import glintbsdf  # noqa: F401  (first: it names the LLVM library that Dr.Jit is
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
+
+from glintbsdf.core import tuning
 
 # Besides the variant of the run: several wavelengths per ray, one channel, Mueller matrices.
 OTHER_COLOURS = ("spectral", "mono", "spectral_polarized")
@@ -40,6 +43,17 @@ def _activate(name: str) -> str:
         pytest.skip(f"no device for {name}")
     mi.set_variant(name)
     return name
+
+
+@pytest.fixture
+def tune(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Change constants of every backend's table, by name, for the test."""
+
+    def change(**values: float) -> None:
+        for backend, table in tuning.TABLES.items():
+            monkeypatch.setitem(tuning.TABLES, backend, replace(table, **values))
+
+    return change
 
 
 @pytest.fixture

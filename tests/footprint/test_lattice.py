@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from glintbsdf.footprint.lattice import BLOCK, Axis, Lattice
+from glintbsdf.footprint.lattice import BLOCK, Lattice, LatticeAxis
 
 SIZES = (1, 2, 3, 7, 8, 9, 37, 64)
 POSITIONS = np.arange(-300, 300)
@@ -24,7 +24,7 @@ def wrapped(x, texels, wrap_mode):
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 @pytest.mark.parametrize("texels", SIZES)
 def test_locate(variant, texels, wrap_mode):
-    axis = Axis(texels, wrap_mode)
+    axis = LatticeAxis(texels, wrap_mode)
     origin, index, end = (
         np.broadcast_to(np.array(v), POSITIONS.shape) for v in axis.locate(mi.Int(POSITIONS))
     )
@@ -44,7 +44,7 @@ def test_locate(variant, texels, wrap_mode):
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 def test_runs_begin_and_end_with_blocks_outside_of_a_clamped_map(variant, wrap_mode):
-    axis = Axis(37, wrap_mode)
+    axis = LatticeAxis(37, wrap_mode)
     _, index, end = (np.array(v) for v in axis.locate(mi.Int(POSITIONS)))
     if wrap_mode == "clamp":
         assert axis.quads % BLOCK == 0 and (end % BLOCK == 0).all()

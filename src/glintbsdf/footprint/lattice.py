@@ -20,7 +20,7 @@ def floor_int(x):
     return mi.Int(dr.floor(x))
 
 
-class Axis:
+class LatticeAxis:
     """One axis of the lattice: ``texels`` texels, wrapped by ``wrap_mode``.
 
     Attributes:
@@ -99,12 +99,12 @@ class Lattice:
     vertices of a block of quads then lie in 15 lines instead of 20.
 
     Attributes:
-        x, y (Axis): columns and rows.
+        x, y (LatticeAxis): columns and rows.
         source (uint32 array): flat index of the texel shown by each stored vertex.
     """
 
     def __init__(self, height: int, width: int, wrap_mode: str) -> None:
-        self.x, self.y = Axis(width, wrap_mode), Axis(height, wrap_mode)
+        self.x, self.y = LatticeAxis(width, wrap_mode), LatticeAxis(height, wrap_mode)
         tiles = -(-(self.y.quads + 1) // 2), -(-(self.x.quads + 1) // 4)
         self.pitch = 8 * tiles[1]  # of a row of tiles
         rows = np.resize(self.y.source, 2 * tiles[0]).reshape(tiles[0], 1, 2, 1)

@@ -29,7 +29,7 @@ from glintbsdf.footprint.kernels import difference_of_products
 SIGMA_H = 1 / sqrt(8 * log(2))
 
 
-def cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
+def exact_cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
     """z component of the cross product of two vectors of the plane, without cancellation."""
     return difference_of_products(a.x, b.y, a.y, b.x)
 
@@ -55,7 +55,7 @@ class Gaussian:
             xx, xy, yy = dr.fma(v.x, v.x, xx), dr.fma(v.x, v.y, xy), dr.fma(v.y, v.y, yy)
             determinant = dr.fma(variance, dr.squared_norm(v), determinant)
         for v, w in combinations(self.vectors, 2):
-            determinant = determinant + dr.square(cross(v, w))
+            determinant = determinant + dr.square(exact_cross(v, w))
         self.xx, self.xy, self.yy, self.determinant = xx, xy, yy, determinant
         self.inverse_root = dr.rsqrt(determinant)
         self.peak = self.inverse_root * (1 / (2 * pi))
@@ -64,7 +64,7 @@ class Gaussian:
         """The squared Mahalanobis distance of ``d``."""
         form = self.variance * dr.squared_norm(d)
         for v in self.vectors:
-            form = form + dr.square(cross(v, d))
+            form = form + dr.square(exact_cross(v, d))
         return form * dr.square(self.inverse_root)
 
     def eval(self, d: mi.Vector2f) -> mi.Float:
@@ -112,7 +112,7 @@ class Overlap:
             # S v⊥, v⊥·s being v × s
             image = lobe.variance * across
             for s in lobe.vectors:
-                image = image + cross(v, s) * s
+                image = image + exact_cross(v, s) * s
             xx, xy = dr.fma(image.x, across.x, xx), dr.fma(image.x, across.y, xy)
             yx, yy = dr.fma(image.y, across.x, yx), dr.fma(image.y, across.y, yy)
         for s in lobe.vectors:

@@ -13,6 +13,7 @@ import scipy.spatial
 from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check.reference import binned_pndf, texel_covariance
 from glintbsdf.core.errors import ParameterError
+from glintbsdf.core.tuning import tuning
 from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
 from glintbsdf.pndf import Elements, Flakes
 from glintbsdf.pndf.elements import elements
@@ -74,7 +75,7 @@ def mixture(normal_map, step, sigma_r, curved, m, sigma_p):
     sigma = np.sqrt(np.linalg.eigvalsh(t)[0]) / step
     small = 10 - 6 * SIGMA_H**2 / sigma**2
     touched = (2 * np.sqrt(small * np.diag(t)) + 1).prod()
-    few = touched <= elements.FEW_CELLS  # with cells of one texel
+    few = touched <= tuning().few_cells  # with cells of one texel
     cut = small if few else 10 + 3.5 * max(np.log2(2.5 / sigma), 0)
     w = np.exp(-0.5 * rho2) * np.clip((cut - rho2) / 2, 0, 1)
     w /= w.sum()
@@ -199,7 +200,7 @@ def test_footprint_larger_than_the_map(variant):
     assert abs(integral(pndf, Footprint.isotropic(mi.Point2f(UV), 5.0), 0.01) - 1) < 1e-3
 
 
-def test_lists_leave_out_little(variant, monkeypatch):
+def test_lists_leave_out_little(variant, monkeypatch, tune):
     """All cells against the lists, for the same cut: at most what NORMAL_REACH says."""
     pndf = Elements(MAP, 0.01, 0.5)
     monkeypatch.setattr(elements, "cut_of_sums", lambda sigma, _: elements.cut_of_lists(sigma))
@@ -207,7 +208,7 @@ def test_lists_leave_out_little(variant, monkeypatch):
     m = draw(pndf, seen, 3000)
     densities = {}
     for limit in (0, np.inf):
-        monkeypatch.setattr(elements, "FEW_CELLS", limit)
+        tune(few_cells=limit)
         densities[limit] = pndf.eval(m, seen).numpy()
     # Of normals drawn from D, the mean of a relative difference is the share of the mass.
     assert abs(np.mean(densities[0] / densities[np.inf]) - 1) < 1e-3

@@ -10,11 +10,12 @@ import pytest
 from glintbsdf import NormalMap, maps
 from glintbsdf.core import cache
 from glintbsdf.core.errors import ParameterError
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS
 from glintbsdf.pndf import Manifold
 from glintbsdf.pndf.index.lists import QuadLists
-from glintbsdf.pndf.manifold import exact as manifold
+from glintbsdf.pndf.manifold.mesh import equilateral
 
 SHAPES = [(64, 48), (37, 53), (3, 5), (1, 1), (1, 70)]
 
@@ -51,13 +52,13 @@ def draw(pndf, footprint, count, seed=3):
 
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_lists_equal_the_loop_over_all_quads(variant, monkeypatch, shape, wrap_mode):
+def test_lists_equal_the_loop_over_all_quads(variant, tune, shape, wrap_mode):
     pndf = Manifold(noise(shape, wrap_mode))
     footprint = random_footprints(2000)
     m = draw(pndf, footprint, 2000)
     density = {}
     for few in (0, np.inf):
-        monkeypatch.setattr(manifold, "FEW_QUADS", few)
+        tune(few_quads=few)
         density[few] = pndf.eval(m, footprint).numpy()
     # Equal but for the order of the sum: 2e-6 was measured.
     assert np.allclose(density[0], density[np.inf], rtol=1e-5, atol=1e-3)
@@ -65,8 +66,8 @@ def test_lists_equal_the_loop_over_all_quads(variant, monkeypatch, shape, wrap_m
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_both_ways_give_the_same_where_they_meet(variant, monkeypatch, kernel):
-    """Footprints around FEW_QUADS, every lane choosing for itself: as if all took one way."""
+def test_both_ways_give_the_same_where_they_meet(variant, tune, kernel):
+    """Footprints around few_quads, every lane choosing for itself: as if all took one way."""
     normal_map = maps.isotropic(64, seed=1)
     pndf = Manifold(normal_map, kernel)
     sigma = mi.Float(np.linspace(0.3, 3, 4000).astype(np.float32) / 64)
@@ -74,19 +75,19 @@ def test_both_ways_give_the_same_where_they_meet(variant, monkeypatch, kernel):
     m = draw(pndf, footprint, 4000)
     together = pndf.eval(m, footprint).numpy()
     kernels = pndf.texel_kernel(footprint)
-    few = kernels.touched_quads().numpy() <= manifold.FEW_QUADS
+    few = kernels.touched_quads().numpy() <= tuning().few_quads
     assert few.any() and not few.all() and (together > 0).mean() > 0.998
-    monkeypatch.setattr(manifold, "FEW_QUADS", np.inf)
+    tune(few_quads=np.inf)
     # Equal but for the order of the sum, as above.
     assert np.allclose(together, pndf.eval(m, footprint).numpy(), rtol=1e-5, atol=1e-3)
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test_derivatives_of_lists_equal_those_of_the_loop_over_all_quads(variant, monkeypatch, mode):
+def test_derivatives_of_lists_equal_those_of_the_loop_over_all_quads(variant, tune, mode):
     normal_map = maps.isotropic(64, seed=1)
     derivatives = {}
-    for few in (manifold.FEW_QUADS, np.inf):
-        monkeypatch.setattr(manifold, "FEW_QUADS", few)
+    for few in (tuning().few_quads, np.inf):
+        tune(few_quads=few)
         pndf, sigma = Manifold(normal_map), mi.Float(0.08)
         footprint = Footprint.isotropic(mi.Point2f(mi.Float(0.3, 0.6, 0.9), 0.7), sigma)
         m = draw(pndf, footprint, 3)
@@ -161,7 +162,7 @@ def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
     footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.2)
     s = np.array(draw(pndf, footprint, count))
     drawn = (np.abs(s - np.array(middle)[:, None]) < 1e-3).all(axis=0).mean()
-    half = 1.1 * manifold.equilateral(1e-9)[0][1]  # of a square about all of their normals
+    half = 1.1 * equilateral(1e-9)[0][1]  # of a square about all of their normals
     s = np.array(middle)[:, None] + half * np.random.default_rng(4).uniform(-1, 1, (2, count))
     mass = pndf.eval(mi.Vector2f(np.float32(s)), footprint).numpy().mean() * (2 * half) ** 2
     # 0.03: their noise is 2 %; half of the triangles had been drawn, but not evaluated.

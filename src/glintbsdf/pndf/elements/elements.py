@@ -23,6 +23,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
@@ -34,9 +35,6 @@ from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
-
-#: Footprints that touch no more cells than this are summed cell by cell; larger ones use the lists.
-FEW_CELLS = 25
 
 #: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
 #: what large footprints skip: small ones sum without a cut.
@@ -481,7 +479,7 @@ class Elements(Mixture):
         return seen
 
     def is_small(self, kernel, steps):
-        return kernel.touched_quads() <= FEW_CELLS
+        return kernel.touched_quads() <= tuning().few_cells
 
     def sum_all(self, kernel, add, active, zero):
         return every_quad(self.lattice, kernel, add, active, zero)

@@ -131,7 +131,7 @@ def central(origin: list, averages: list, spread: Spread) -> list:
 
 
 @dataclass(frozen=True)
-class Axis:
+class SampleAxis:
     """``count`` samples at ``origin + k spacing`` (texels) along one axis.
 
     Beyond them they repeat, or the outermost go on for ever.
@@ -150,21 +150,21 @@ class Axis:
         return mi.UInt32(dr.clip(index, 0, self.count - 1))
 
 
-def level_axis(texels: int, spacing: float, periodic: bool) -> Axis:
+def level_axis(texels: int, spacing: float, periodic: bool) -> SampleAxis:
     """The samples of a level with at most this spacing along an axis of ``texels``."""
     if periodic:
         count = ceil(texels / spacing)
         spacing = texels / count
-        return Axis(count, spacing / 2 - 0.5, spacing, True)
+        return SampleAxis(count, spacing / 2 - 0.5, spacing, True)
     count = ceil(texels / spacing) + 2 * BORDER
-    return Axis(count, (0.5 - BORDER) * spacing - 0.5, spacing, False)
+    return SampleAxis(count, (0.5 - BORDER) * spacing - 0.5, spacing, False)
 
 
 def smooth(
     channels: list,
-    axes: tuple[Axis, Axis],
+    axes: tuple[SampleAxis, SampleAxis],
     along: int,
-    target: Axis,
+    target: SampleAxis,
     variance: float,
     spread: Spread,
 ) -> list:
@@ -174,7 +174,7 @@ def smooth(
         channels: arrays (``mi.Float``) of rows × columns samples.
         axes: of rows and of columns.
         along (int): which of them.
-        target (Axis): where to sample.
+        target (SampleAxis): where to sample.
         variance (float): of the Gaussian, texels².
         spread: see :class:`MomentPyramid`.
     """
@@ -210,7 +210,7 @@ def smooth(
     return central(origin, [total / weights for total in totals], spread)
 
 
-def all_texels(normals, texels: tuple[Axis, Axis], axes: tuple[Axis, Axis]):
+def all_texels(normals, texels: tuple[SampleAxis, SampleAxis], axes: tuple[SampleAxis, SampleAxis]):
     """The normals (``mi.Vector2f``) at the samples of ``axes``, which are texels."""
     index = dr.arange(mi.UInt32, axes[0].count * axes[1].count)
     row, column = (
@@ -221,16 +221,16 @@ def all_texels(normals, texels: tuple[Axis, Axis], axes: tuple[Axis, Axis]):
     return dr.gather(mi.Vector2f, normals, index)
 
 
-def quad_averages(over_quad: Callable, normals, axes: tuple[Axis, Axis]):
+def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAxis]):
     """What ``over_quad`` makes of the normals at the corners of each quad between four texels.
 
     Returns that and the axes of the quads' centres.
     """
     # Where the map is not periodic there is a constant quad beyond each border.
     quads = tuple(
-        Axis(axis.count, 0.5, 1.0, True)
+        SampleAxis(axis.count, 0.5, 1.0, True)
         if axis.periodic
-        else Axis(axis.count + 1, -0.5, 1.0, False)
+        else SampleAxis(axis.count + 1, -0.5, 1.0, False)
         for axis in axes
     )
     index = dr.arange(mi.UInt32, quads[0].count * quads[1].count)
@@ -273,7 +273,7 @@ def midpoint_rule(moments: Callable, spread: Spread, corners: list) -> list:
     return central(origin, averages, spread)
 
 
-def samples_within(axis: Axis, first: float, last: float) -> tuple[int, int]:
+def samples_within(axis: SampleAxis, first: float, last: float) -> tuple[int, int]:
     """First and number of the samples that an interpolation between two positions (texels) needs.
 
     Those of a periodic axis need not lie within its period.
@@ -291,7 +291,7 @@ def samples(window) -> int:
     return rows * columns
 
 
-def cut_out(level: list, axes: tuple[Axis, Axis], window) -> list:
+def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
     """The part of a level in a window, which may lie across the border."""
     (top, rows), (left, columns) = window
     if window == tuple((0, axis.count) for axis in axes):
@@ -303,7 +303,7 @@ def cut_out(level: list, axes: tuple[Axis, Axis], window) -> list:
     return [dr.gather(mi.Float, channel, index) for channel in level]
 
 
-class Grid(NamedTuple):
+class LevelSamples(NamedTuple):
     """Where a level's samples are: the first of a whole level, though it may not be stored, samples
     stored per row, samples per texel, their number and its inverse, these for x and y; the level's
     variance (texels²), and half of the squared spacing."""
@@ -394,7 +394,10 @@ class MomentPyramid:
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
         self.periodic = wrap_mode != "clamp"
         normals, rows, columns = self.one_period(data)
-        texels = Axis(rows, 0.0, 1.0, self.periodic), Axis(columns, 0.0, 1.0, self.periodic)
+        texels = (
+            SampleAxis(rows, 0.0, 1.0, self.periodic),
+            SampleAxis(columns, 0.0, 1.0, self.periodic),
+        )
         self.first = 0 if moments is not None else 1
         self.top = self.first + 1
         while max(rows, columns) > level_sigma(self.top):
@@ -405,7 +408,7 @@ class MomentPyramid:
             last = int(dr.clip(level_below(1.002 * domain.largest**2), self.first, last))
             self.top = last + 1
 
-        def axes_of(number: int) -> tuple[Axis, Axis]:
+        def axes_of(number: int) -> tuple[SampleAxis, SampleAxis]:
             spacing = 2.0 ** max(0, floor(log2(level_sigma(number) * SPACING)))
             return tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
 
@@ -433,7 +436,9 @@ class MomentPyramid:
                 keep(level)
         self.store(stored, shapes, windows)
 
-    def choose_windows(self, shapes: list[tuple[Axis, Axis]], domain: Domain | None) -> list:
+    def choose_windows(
+        self, shapes: list[tuple[SampleAxis, SampleAxis]], domain: Domain | None
+    ) -> list:
         """What to store of each level: ``(first, number)`` of the rows, and of the columns.
 
         All of all levels, or what lies within the domain, if that is less. It may lie across the
@@ -464,7 +469,9 @@ class MomentPyramid:
         mirrored = dr.gather(mi.Vector2f, data.array, row * self.width + column)
         return dr.ravel(mirrored), 2 * self.height, 2 * self.width
 
-    def store(self, levels: list[list], shapes: list[tuple[Axis, Axis]], windows: list) -> None:
+    def store(
+        self, levels: list[list], shapes: list[tuple[SampleAxis, SampleAxis]], windows: list
+    ) -> None:
         """Lay the levels out one after the other, as records of four numbers, and of one each.
 
         ``windows``: of each level ``(first, number)`` of the rows, and of the columns, given.
@@ -532,12 +539,12 @@ class MomentPyramid:
         weights = dr.select(active, weights, 1)
         return central(origin, [total / weights for total in totals], self.spread)
 
-    def grid(self, level) -> Grid:
+    def grid(self, level) -> LevelSamples:
         """The samples of a level (``mi.Float``)."""
         index = mi.UInt32(level - self.first)
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
-        return Grid(
+        return LevelSamples(
             *dr.gather(mi.Vector2u, self.layout, index),
             mi.Vector2f(scale_x, scale_y),
             mi.Vector2f(columns, rows),
@@ -554,7 +561,7 @@ class MomentPyramid:
         weight = dr.clip((variance - fine_variance) * dr.rcp(coarse_variance - fine_variance), 0, 1)
         return [dr.lerp(a, b, weight) for a, b in zip(fine, coarse, strict=True)]
 
-    def corners(self, position, grid: Grid):
+    def corners(self, position, grid: LevelSamples):
         """First and second sample (``mi.Vector2u``: column, row) of a level on either side of a
         position along each axis, and where between them it lies, from 0 to 1."""
         count = grid.count
@@ -576,7 +583,7 @@ class MomentPyramid:
             values.append(dr.gather(mi.Float, self.single, index))
         return values[: self.channels]
 
-    def nearest_means(self, position, grid: Grid) -> list:
+    def nearest_means(self, position, grid: LevelSamples) -> list:
         """The means of a level's sample that is nearest to a position, for an origin."""
         if not self.spread:
             return []
@@ -584,7 +591,7 @@ class MomentPyramid:
         x, y = dr.select(f < 0.5, first, second)
         return origin_of(self.record(grid.offset + y * grid.pitch + x), self.spread)
 
-    def bilinear(self, position, grid: Grid, origin: list):
+    def bilinear(self, position, grid: LevelSamples, origin: list):
         """What a level says at a position, and the variance (texels²) of the kernel there."""
         (x0, y0), (x1, y1), f = self.corners(position, grid)
         rows = [grid.offset + y * grid.pitch for y in (y0, y1)]

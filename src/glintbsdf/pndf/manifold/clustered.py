@@ -27,9 +27,10 @@ import numpy as np
 
 from glintbsdf.core.errors import check
 from glintbsdf.core.progress import progress
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.kernels import REACH, SIGMA_MAX
-from glintbsdf.footprint.lattice import BLOCK, Axis, floor_int
+from glintbsdf.footprint.lattice import BLOCK, LatticeAxis, floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.pndf.base import register
@@ -43,7 +44,7 @@ from glintbsdf.pndf.index.lists import (
     walk,
 )
 from glintbsdf.pndf.manifold.cluster_fit import fit_clusters
-from glintbsdf.pndf.manifold.exact import FEW_QUADS, Manifold
+from glintbsdf.pndf.manifold.exact import Manifold
 from glintbsdf.pndf.manifold.mesh import (
     equilateral,
     normal_in_quad,
@@ -165,8 +166,8 @@ class ClusterLattice:
     """The quads over which clusters are made, and the place of each cluster among all.
 
     Attributes:
-        x, y (Axis): columns and rows. Where the map is clamped, their borders are wider than those
-            of the mesh, see :data:`BORDER`.
+        x, y (LatticeAxis): columns and rows. Where the map is clamped, their borders are wider than
+            those of the mesh, see :data:`BORDER`.
         rungs (int): the highest rung of the ladder, 0 where the map is too small for any.
         levels (int): of clusters.
         shapes (list of pairs): rows and columns of whole clusters, by level; level 0 is the quads.
@@ -179,7 +180,7 @@ class ClusterLattice:
         rungs = int(side).bit_length() - 1 - SHIFT
         self.rungs = rungs if rungs >= FIRST_RUNG else 0
         block = BLOCK << self.rungs
-        self.x, self.y = Axis(width, wrap_mode, block), Axis(height, wrap_mode, block)
+        self.x, self.y = LatticeAxis(width, wrap_mode, block), LatticeAxis(height, wrap_mode, block)
         self.levels = self.rungs + SHIFT if self.rungs else 0
         self.shapes = [(self.y.quads >> k, self.x.quads >> k) for k in range(self.levels + 1)]
         self.first = [0, 0]
@@ -553,7 +554,7 @@ class ClusteredManifold(Manifold):
             radii = kernel.half_u * kernel.half_v
         else:  # the principal ones, of a rotated footprint
             radii = REACH[self.kernel] ** 2 * kernel.sigma_u_given_v * kernel.sigma_v
-        few = kernel.touched_quads() <= FEW_QUADS
+        few = kernel.touched_quads() <= tuning().few_quads
         return dr.select(few, 0, self.ladder.rung(radii * self.threshold))
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:

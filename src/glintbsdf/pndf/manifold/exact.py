@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
@@ -22,9 +23,6 @@ from glintbsdf.pndf.index.lists import QuadLists, Window, every_quad
 from glintbsdf.pndf.manifold import projected_area
 from glintbsdf.pndf.manifold.mesh import TexelMesh, equilateral, quad_density
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
-
-#: Footprints that touch no more quads than this are summed quad by quad; larger ones use the lists.
-FEW_QUADS = 25
 
 
 @register("manifold", title="manifold, exact", plugin="glint_manifold")
@@ -57,7 +55,7 @@ class Manifold(TexelMesh, PNDF):
         """Make the lists of what queries within ``domain`` need; the cache may know them."""
         self.domain = domain
         self.lists = None
-        if domain is not None and domain.most_quads <= FEW_QUADS:
+        if domain is not None and domain.most_quads <= tuning().few_quads:
             return
         window = Window.whole(self.lattice)
         if domain is not None:
@@ -95,7 +93,7 @@ class Manifold(TexelMesh, PNDF):
         active = active & (dr.squared_norm(m) < 1)
         if self.lists is not None:
             active &= self.lists.covers(m)
-        few = kernel.touched_quads() <= FEW_QUADS
+        few = kernel.touched_quads() <= tuning().few_quads
 
         def add(density, row, column, corner, active):
             normals = self.quad_normals(row, column, active)

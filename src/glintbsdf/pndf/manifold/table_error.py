@@ -40,7 +40,7 @@ KNOTS = {"gaussian": (0.45, 0.7, 0.95), "disk": (0.25, 0.55, 0.95), "box": (0.25
 PLACES, PLACES_ON_MAP = 16, 6
 
 #: Bins, about, in which they are.
-BINS = 3000
+CALIBRATION_BINS = 3000
 
 
 def kernel_error(kernel: str, x, mixed: bool = False):

@@ -483,7 +483,7 @@ class NormalTables:
         rows = np.full(bins.rows * bins.columns, cls.EMPTY, np.uint32)
         rows[filled] = np.arange(len(filled))
         ends = np.cumsum(np.concatenate(lengths))
-        some = slice(None, None, max(1, len(filled) // table_error.BINS))
+        some = slice(None, None, max(1, len(filled) // table_error.CALIBRATION_BINS))
         functions = (
             [variances_of(periods, count, counts[0]) for count in counts],
             mixed_levels(counts),

@@ -27,6 +27,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
@@ -216,18 +217,20 @@ class TabulatedManifold(Manifold):
         bottom = floor_int(mean.y + kernel.reach_v)
         x, last = row(y)
 
+        per_turn = tuning().nodes_per_turn
+
         def body(y, x, last, active, *state):
-            # Two nodes at a time: a step takes about as long as it takes to find the next row.
+            # Some nodes at a time: a step takes about as long as it takes to find the next row.
             nodes = []
-            for step in range(2):
+            for step in range(per_turn):
                 inside = active & (x + step <= last)
                 weight = kernel.value(mi.Vector2f(x + step, y) - mean)
                 nodes.append((dr.select(inside, weight, 0), y, x + step, inside))
             state = visit(nodes, *state)
-            new_row = x + 1 >= last
+            new_row = x + (per_turn - 1) >= last
             y = dr.select(new_row, y + 1, y)
             first, final = row(y)
-            x, last = dr.select(new_row, first, x + 2), dr.select(new_row, final, last)
+            x, last = dr.select(new_row, first, x + per_turn), dr.select(new_row, final, last)
             return y, x, last, active & (y <= bottom), *state
 
         state = (y, x, last, mi.Bool(active) & (y <= bottom), *state)

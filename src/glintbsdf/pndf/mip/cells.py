@@ -18,8 +18,8 @@ from glintbsdf.maps.quilting import BEFORE_X, BEFORE_Y, Synthesis
 from glintbsdf.pndf.mip.levels import Layout, morton
 
 
-class Axis:
-    """Grids along either axis of the map, which goes on for ever: repeated, or mirrored.
+class CellAxis:
+    """LevelCells along either axis of the map, which goes on for ever: repeated, or mirrored.
 
     Beyond the map, grids are counted on; :meth:`at` says which stored grid one looks like.
 
@@ -45,9 +45,9 @@ class Axis:
     def nbytes(self) -> int:
         return 4 * (dr.width(self.starts) + dr.width(self.cell_of))
 
-    def on(self, level: mi.UInt32, active: mi.Bool) -> AxisLevel:
+    def on(self, level: mi.UInt32, active: mi.Bool) -> CellsAlongAxis:
         """The axis as one level divides it, for each lane its own."""
-        return AxisLevel(
+        return CellsAlongAxis(
             self,
             level == 0,
             *(dr.gather(type(v), v, level, active) for v in (self.split, self.joined, self.period)),
@@ -55,8 +55,8 @@ class Axis:
         )
 
 
-class AxisLevel:
-    """The grids of one level along an axis; see :class:`Axis`."""
+class CellsAlongAxis:
+    """The grids of one level along an axis; see :class:`CellAxis`."""
 
     def __init__(self, axis, texels, split, joined, period, active) -> None:
         self.axis, self.texels, self.active = axis, texels, active
@@ -110,7 +110,7 @@ class AxisLevel:
         return x + type(x)(turn * self.axis.size)
 
 
-class Grids:
+class LevelCells:
     """Where the lobes of a grid are found: runs of consecutive lobes in one array.
 
     Args:
@@ -128,7 +128,7 @@ class Grids:
         self.layout = layout = Layout.of(synthesis)
         self.clusters, self.overlap = clusters, synthesis.overlap
         self.count = len(synthesis.patch)
-        self.axis = Axis(synthesis, layout, mirrored)
+        self.axis = CellAxis(synthesis, layout, mirrored)
         self.divisions = len(layout.divisions)
         self.levels = 1 + self.divisions + len(layout.cells)
         self.patch = mi.UInt32(synthesis.patch.ravel())
@@ -162,7 +162,7 @@ class Grids:
         lower, upper = (dr.gather(mi.Vector2f, self.normals, 2 * level + k, active) for k in (0, 1))
         return dr.all((m > lower - margin) & (m < upper + margin))
 
-    def run(self, level, axis: AxisLevel, y, x, flipped, active):
+    def run(self, level, axis: CellsAlongAxis, y, x, flipped, active):
         """The lobes of the stored grid (``y``, ``x``): ``(first, count, first_2, count_2)``.
 
         The second run, of those in the cell's overlaps, is empty but for divisions of cells. For

@@ -24,6 +24,7 @@ from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check, check_whole, warn
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
@@ -35,7 +36,7 @@ from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_u
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
 from glintbsdf.pndf.manifold.mesh import add_where
 from glintbsdf.pndf.mip import levels as lobe_levels
-from glintbsdf.pndf.mip.cells import Grids
+from glintbsdf.pndf.mip.cells import LevelCells
 from glintbsdf.pndf.mip.packing import NORMAL_CUT, Lobe
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
@@ -50,9 +51,6 @@ MAX_ANISOTROPY = 16.0
 #: Squared distance, in standard deviations of footprint and lobe together, from which on lobes of
 #: grids count for nothing: 0.4 % of the mass.
 GRID_CUT = 12.25
-
-#: Lobes per turn of the loop, whose overhead would otherwise cost as much as a lobe.
-PER_TURN = 4
 
 
 @register(
@@ -150,7 +148,7 @@ class Mip(PNDF):
         self.synthesis = Synthesis.from_arrays(
             sample.normals, self.options["output_size"], self.options["overlap"], arrays
         )
-        self.grids = Grids(
+        self.grids = LevelCells(
             self.synthesis, arrays, self.clusters, mirrored=self.wrap_mode != "repeat"
         )
         self.words = mi.UInt32(lobe_levels.all_words(arrays))
@@ -182,7 +180,7 @@ class Mip(PNDF):
     def level(self, kernel: TexelKernel) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Eq. 8: the levels below and above λ, and the weight of the one above (Eq. 9).
 
-        The levels are indices of :class:`~.Grids`. Between texels and the
+        The levels are indices of :class:`~.LevelCells`. Between texels and the
         finest grids that there are, λ belongs to the texels.
         """
         variance = dr.square(kernel.sigma_u) + dr.square(kernel.sigma_v)
@@ -201,8 +199,8 @@ class Mip(PNDF):
 
         ``offset`` (texels) is the footprint's centre as seen from the origin of the lobe's
         positions, in the frame of the lobe's copy of the map, whose axes a mirrored map flips:
-        ``sign``. One flat loop, :data:`PER_TURN` lobes a turn. What is not summed is whole numbers:
-        Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
+        ``sign``. One flat loop, ``lobes_per_turn`` of them a turn. What is not summed is whole
+        numbers: Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
         """
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
@@ -259,6 +257,8 @@ class Mip(PNDF):
                 label="next grid",
             )
 
+        per_turn = tuning().lobes_per_turn
+
         def body(state, walk):
             walk = dr.if_stmt(
                 walk,
@@ -270,13 +270,13 @@ class Mip(PNDF):
             first, count, first_2, count_2, y, x, right, origin, sign = walk
             inside = active & (y <= bottom)
             axes = mi.Vector2f(sign) if mirrored else mi.Vector2f(1)
-            for k in range(PER_TURN):
+            for k in range(per_turn):
                 found = inside & (count > k)
                 place = mi.Vector2i(origin.x + dr.select(texels, k, 0), origin.y)
                 offset = (mean - mi.Vector2f(place)) * axes
                 lobe = Lobe(self.words, first + k, found)
                 state = add(state, lobe, offset, axes, found)
-            taken = dr.minimum(count, PER_TURN)
+            taken = dr.minimum(count, per_turn)
             origin = mi.Vector2i(origin.x + dr.select(texels, mi.Int(taken), 0), origin.y)
             count = dr.select(inside, count - taken, count)
             return state, (first + taken, count, first_2, count_2, y, x, right, origin, sign)
