@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from glintbsdf.scene import merging, storage, units
-from glintbsdf.scene.merging import Image, merge
+from glintbsdf.scene.image import Image
+from glintbsdf.scene.merging import merge
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.storage import Checkpoint, Refused
 from glintbsdf.scene.units import Plan

@@ -17,7 +17,7 @@ import click
 
 from glintbsdf.core.progress import progress
 from glintbsdf.scene import inspection, rendering
-from glintbsdf.scene.merging import Image
+from glintbsdf.scene.image import Image
 from glintbsdf.scene.package import Job, Package
 from glintbsdf.scene.storage import Checkpoint
 

@@ -18,7 +18,8 @@ from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.scene import passes
 from glintbsdf.scene.denoising import denoised, guided
-from glintbsdf.scene.merging import Image, Results, merge
+from glintbsdf.scene.image import Image
+from glintbsdf.scene.merging import Results, merge
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.storage import Checkpoint
 from glintbsdf.scene.units import Plan, Unit

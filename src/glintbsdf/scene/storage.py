@@ -13,14 +13,11 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from glintbsdf.scene.image import Image
 from glintbsdf.scene.passes import Tile
-
-if TYPE_CHECKING:
-    from glintbsdf.scene.merging import Image
 
 #: Of the files of a checkpoint; another number means that they cannot be read.
 FORMAT = 1
