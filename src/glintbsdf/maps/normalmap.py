@@ -63,6 +63,16 @@ class MapShape(NamedTuple):
     wrap_mode: str
 
 
+def map_bytes(normal_map: NormalMap) -> int:
+    """Memory of a map and of its tensor in the active variant, bytes.
+
+    On the CPU the tensor is the NumPy array itself; a GPU has a copy of its own.
+    """
+    import mitsuba as mi
+
+    return normal_map.nbytes * (1 if (mi.variant() or "").startswith("llvm") else 2)
+
+
 class NormalMap:
     """A map of unit normals.
 

@@ -14,6 +14,7 @@ from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check import suite
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.footprint.kernels import KERNELS
+from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import (
     MANY_QUADS,
@@ -448,18 +449,19 @@ def together(views: list[View], lanes: int) -> mi.SurfaceInteraction3f:
 def test_smith_lambda(variant):
     mesh = TexelMesh(MASKING_MAPS["rough"])
     footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.1)
+    query = Query(footprint)
     for area in (ProjectedArea(mesh), GgxFit(mesh)):
         correlated, separable = (ProjectedAreaMasking(area, flag) for flag in (True, False))
         wi, wo = direction(1.3, 0.4), direction(1.0, 2.0)
         p_i, p_o = (area.eval(w, footprint)[0] for w in (wi, wo))
         lambda_i, lambda_o = max(p_i / wi.z[0] - 1, 0), max(p_o / wo.z[0] - 1, 0)
         assert lambda_i > 0.02
-        g = correlated.eval(wi, wo, footprint, True)[0]
+        g = correlated.eval(wi, wo, query, mi.TransportMode.Radiance, True)[0]
         assert g == pytest.approx(1 / (1 + lambda_i + lambda_o), rel=1e-5)
-        g = separable.eval(wi, wo, footprint, True)[0]
+        g = separable.eval(wi, wo, query, mi.TransportMode.Radiance, True)[0]
         assert g == pytest.approx(1 / ((1 + lambda_i) * (1 + lambda_o)), rel=1e-5)
         for w in (mi.Vector3f(1, 0, 1e-7), mi.Vector3f(1, 0, 1e-30)):
-            assert 0 <= correlated.eval(w, wo, footprint, True)[0] <= 1
+            assert 0 <= correlated.eval(w, wo, query, mi.TransportMode.Radiance, True)[0] <= 1
 
 
 @pytest.mark.parametrize("masking", ["analytic", "ggx_fit"])

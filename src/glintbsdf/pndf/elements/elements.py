@@ -29,7 +29,7 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
 from glintbsdf.footprint.query import Query
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import NormalMap, map_bytes
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
@@ -578,7 +578,7 @@ class Elements(Mixture):
         self.build(self.domain)
 
     def parts(self) -> dict[str, int]:
-        return {"map": self.normal_map.nbytes + 4 * dr.width(self.data), **super().parts()}
+        return {"map": map_bytes(self.normal_map), **super().parts()}
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape

@@ -21,7 +21,7 @@ from glintbsdf.core.errors import check, check_choice
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
-from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels
+from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels, map_bytes
 from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
 from glintbsdf.pndf.base import PNDF, register
@@ -299,7 +299,7 @@ class Filtered(PNDF):
         """Memory of each part of the structure, bytes."""
         levels = f"MIP levels {self.pyramid.first} to {self.pyramid.top}"
         return {
-            "map": self.normal_map.nbytes + 4 * dr.width(self.data),
+            "map": map_bytes(self.normal_map),
             levels: self.pyramid.nbytes,
         }
 

@@ -19,7 +19,7 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
 from glintbsdf.footprint.lattice import Lattice, floor_int
 from glintbsdf.footprint.query import Query
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import NormalMap, map_bytes
 
 
 def cross(a, b):
@@ -248,7 +248,7 @@ class TexelMesh:
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
         return {
-            "map": self.normal_map.nbytes + 4 * dr.width(self.data),
+            "map": map_bytes(self.normal_map),
             "vertices": 4 * dr.width(self.vertices),
         }
 

@@ -29,7 +29,7 @@ from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
 from glintbsdf.footprint.query import Query
-from glintbsdf.maps.normalmap import MapShape, NormalMap
+from glintbsdf.maps.normalmap import MapShape, NormalMap, map_bytes
 from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
@@ -439,7 +439,7 @@ class Mip(PNDF):
     def parts(self) -> dict[str, int]:
         """Memory of sample, lobes and look-up tables, bytes."""
         return {
-            "sample": self.sample_map.nbytes + 4 * dr.width(self.data),
+            "sample": map_bytes(self.sample_map),
             "lobes": 4 * dr.width(self.words),
             "grids": self.grids.nbytes,
         }
