@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import signal
 import socket
@@ -212,42 +213,33 @@ def test_until_noise(job, two):
 # ---------------------------------------------------------------------------------------------
 
 
-class Forgetful:
-    """A client whose workers cannot hold units of more than some samples."""
+def no_more_than(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let workers have no memory for units of more than ``most`` samples."""
+    original = clusters.packed
 
-    def __init__(self, client, most: int, error: type[Exception]) -> None:
-        self.client, self.most, self.error = client, most, error
+    def packed(job: Job, unit: units.Unit) -> bytes:
+        if unit.spp * unit.tile.pixels > most:
+            return pickle.dumps(clusters._Call(bytes, 1 << 62))  # more than there can be
+        return original(job, unit)
 
-    def submit(self, function, job, unit, *arguments, **options):
-        if unit.spp * unit.tile.pixels > self.most:
-            return self.client.submit(_fail, self.error, unit.index, pure=False)
-        return self.client.submit(function, job, unit, *arguments, **options)
-
-    def __getattr__(self, name: str):
-        return getattr(self.client, name)
+    monkeypatch.setattr(clusters, "packed", packed)
 
 
-def _fail(error: type[Exception], index: int) -> None:
-    raise error(f"of unit {index}")
-
-
-def test_a_unit_that_is_too_large_is_halved(job, two, capsys):
-    """Down to an eighth of its samples: another image of the same light."""
-    forgetful = Cluster(None, print)
-    forgetful.client = Forgetful(two.client, 128, MemoryError)
-    halved = image(job, forgetful)
+def test_a_unit_that_is_too_large_is_halved(job, two, capsys, monkeypatch):
+    """To half of its samples: another image of the same light."""
+    no_more_than(256, monkeypatch)
+    halved = image(job, two)
     assert "halved, so that the noise of the image is another" in capsys.readouterr().out
-    assert np.array_equal(halved, image(job, forgetful))
+    assert np.array_equal(halved, image(job, two))
     expected = image(job, None)
     assert not np.array_equal(halved, expected)
     assert halved.mean() == pytest.approx(expected.mean(), rel=0.05)
 
 
-def test_a_scene_that_is_too_large_is_told(job, two):
-    forgetful = Cluster(None, print)
-    forgetful.client = Forgetful(two.client, 0, MemoryError)
+def test_a_scene_that_is_too_large_is_told(job, two, monkeypatch):
+    no_more_than(0, monkeypatch)
     with pytest.raises(ClusterError, match="needs more memory than they have"):
-        image(job, forgetful)
+        image(job, two)
 
 
 def test_sums_of_halves():
@@ -342,20 +334,30 @@ def test_a_local_cluster_listens_on_loopback_only(two):
 class Scheduler:
     """``dask scheduler`` and a ``dask worker``, as a user starts them."""
 
-    def __init__(self, folder: Path, *options: str, scheme: str = "tcp") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        scheme: str = "tcp",
+        worker_path: Path | None = None,
+        scheduler_path: Path | None = None,
+    ) -> None:
         self.address = f"{scheme}://127.0.0.1:{closed_port()}"
         port = self.address.rpartition(":")[2]
         common = ["--host", "127.0.0.1", *options]
         self.processes = [
-            self.start(folder, "scheduler", "--port", port, "--no-dashboard", *common),
-            self.start(folder, "worker", self.address, "--no-dashboard", *common),
+            self.start(
+                folder, scheduler_path, "scheduler", "--port", port, "--no-dashboard", *common
+            ),
+            self.start(folder, worker_path, "worker", self.address, "--no-dashboard", *common),
         ]
 
     @staticmethod
-    def start(folder: Path, *arguments: str) -> subprocess.Popen:
+    def start(folder: Path, path: Path | None, *arguments: str) -> subprocess.Popen:
         return subprocess.Popen(
             [sys.executable, "-m", "dask", *arguments],
             cwd=folder,
+            env=os.environ if path is None else {**os.environ, "PYTHONPATH": str(path)},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -395,6 +397,62 @@ def test_a_killed_scheduler(job, folder, tmp_path):
         scheduler.kill()
     assert counts[0] >= 5
     assert np.array_equal(resumed, image(job, None))
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    """A folder for PYTHONPATH with which a Python has no glintbsdf."""
+    path = tmp_path / "without"
+    path.mkdir()
+    (path / "sitecustomize.py").write_text(
+        "import sys, importlib.metadata as metadata\n"
+        "class Without:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'glintbsdf':\n"
+        "            raise ModuleNotFoundError(f\"No module named '{name}'\", name=name)\n"
+        "sys.meta_path.insert(0, Without())\n"
+        "version = metadata.version\n"
+        "def without(name):\n"
+        "    if name == 'glintbsdf':\n"
+        "        raise metadata.PackageNotFoundError(name)\n"
+        "    return version(name)\n"
+        "metadata.version = without\n"
+    )
+    return path
+
+
+def worker_there(scheduler: Scheduler) -> None:
+    """Wait until the worker of a scheduler has come."""
+    from distributed import Client
+
+    with Client(scheduler.address, timeout=60) as client:
+        client.wait_for_workers(1, timeout=60)
+
+
+def test_a_worker_without_the_package(job, tmp_path, elsewhere):
+    scheduler = Scheduler(tmp_path, worker_path=elsewhere)
+    try:
+        worker_there(scheduler)
+        with pytest.raises(ClusterError, match=r"the worker tcp://\S+ has no glintbsdf"):
+            Cluster.at(scheduler.address, tell=print).__enter__()
+        late = Cluster(None, print)  # one that came when nobody asked any more
+        from distributed import Client
+
+        with Client(scheduler.address) as late.client:
+            with pytest.raises(ClusterError, match="a worker lacks a package: .*glintbsdf"):
+                image(job, late)
+    finally:
+        scheduler.kill()
+
+
+def test_a_scheduler_without_the_package(job, tmp_path, elsewhere):
+    """It needs none."""
+    scheduler = Scheduler(tmp_path, scheduler_path=elsewhere)
+    try:
+        with Cluster.at(scheduler.address, tell=print) as cluster:
+            assert np.array_equal(image(job, cluster), image(job, None))
+    finally:
+        scheduler.kill()
 
 
 @pytest.fixture

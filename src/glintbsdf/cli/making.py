@@ -211,7 +211,7 @@ def make(
         missed = trimmed.missed if trimmed else lambda: False
         with (
             rendering.Renderer(loaded, subject.spp, subject.denoise, missed) as renderer,
-            progress(label) as report,
+            progress(label if cluster is None else f"{label} by {cluster}") as report,
         ):
             picture, interrupted = _produce(subject, renderer, making, cluster, report)
         rendering.save(picture.bitmap, unfinished)

@@ -15,9 +15,11 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import pickle
 import signal
 import threading
 import time
+import uuid
 import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
@@ -54,7 +56,11 @@ AHEAD = 2
 SCENES = 2
 
 #: How often a unit that needs too much memory is halved.
-HALVINGS = 3
+HALVINGS = 2
+
+#: How often a unit is given to workers again that have died of it, and not for want of memory as
+#: far as Dask knows. Dask itself does so once or more each time.
+TRIALS = 2
 
 
 GONE = "the scheduler is gone; with --checkpoint the same command goes on from what is done"
@@ -98,11 +104,31 @@ class Answer:
     trimmed_too_far: bool = False
 
 
-def work(job: Job, unit: Unit, expected: dict[str, str]) -> Answer:
+class _Call:
+    """What calls a function where it is unpickled."""
+
+    def __init__(self, function: Callable, *arguments: object) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> tuple[Callable, tuple]:
+        return self.call
+
+
+def packed(job: Job, unit: Unit) -> bytes:
+    """A task for Dask: ``pickle.loads`` of this is :func:`work`.
+
+    A worker without this package, or with another version, can receive it and fail with a sentence.
+    A task that it cannot read would end it, again and again.
+    """
+    return pickle.dumps(_Call(work, versions(), pickle.dumps((job, unit))))
+
+
+def work(expected: dict[str, str], task: bytes) -> Answer:
     """Render a unit, on a worker.
 
     Args:
         expected: versions that the worker must have.
+        task: the pickled job and unit.
 
     Raises:
         ClusterError: it has others, or lacks what the variant needs.
@@ -114,6 +140,7 @@ def work(job: Job, unit: Unit, expected: dict[str, str]) -> Answer:
     difference = version_difference(expected)
     if difference is not None:
         raise ClusterError(f"the worker {worker.address} has {difference}")
+    job, unit = pickle.loads(task)
     with _lock:
         store = Store(Path(worker.local_directory) / "glintbsdf-files")
         missing = job.package.missing(store) if job not in _loaded else []
@@ -352,6 +379,10 @@ class Cluster:
         """Workers that are there now."""
         return len(self.client.nthreads())
 
+    def __str__(self) -> str:
+        count = self.worker_count
+        return f"{count} worker" + ("s" if count != 1 else "")
+
     def render_all(self, job: Job) -> Callable[[Iterator[Unit]], Results]:
         """What renders the units of a job, for :func:`~glintbsdf.scene.rendering.produce`.
 
@@ -370,6 +401,8 @@ _LOCAL_SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
     "distributed.scheduler.allowed-failures": 1,
+    # A unit that waits at a worker is not suspected of its death.
+    "distributed.scheduler.worker-saturation": 1.0,
     "distributed.scheduler.worker-ttl": None,
     "distributed.admin.tick.limit": "1h",
 }
@@ -391,15 +424,20 @@ class _Rendering:
         self.flying: dict[object, _Errand] = {}
         self.halves: dict[int, dict[tuple[int, ...], tuple[Tile, np.ndarray]]] = {}
         self.sent: Counter[tuple[str, Content]] = Counter()
+        self.deaths: Counter[_Errand] = Counter()
         self.told: set[str] = set()
 
     def results(self, units: Iterator[Unit]) -> Results:
         units = iter(units)
-        begun, ended = time.monotonic(), False
+        alive, ended = time.monotonic(), False
         try:
             while True:
                 with _connected():
                     workers = self.cluster.worker_count
+                if workers:
+                    alive = time.monotonic()
+                elif time.monotonic() - alive > 10:
+                    self.tell_once("there is no worker; waiting for one")
                 while not ended and len(self.flying) < AHEAD * max(1, workers):
                     unit = next(units, None)
                     if unit is None:
@@ -408,8 +446,6 @@ class _Rendering:
                         self.submit(_Errand(unit, ()))
                 if not self.flying:
                     return
-                if not workers and time.monotonic() - begun > 10:
-                    self.tell_once("no worker has come yet; waiting")
                 done = self.landed()
                 if not done:
                     yield None
@@ -434,7 +470,11 @@ class _Rendering:
         # The first units are the first to be merged.
         with _connected():
             future = self.client.submit(
-                work, self.job, errand.unit, versions(), pure=False, priority=-errand.unit.index
+                pickle.loads,
+                packed(self.job, errand.unit),
+                key=f"unit-{errand.unit.index}-{uuid.uuid4().hex}",
+                priority=-errand.unit.index,
+                pure=False,
             )
         self.flying[future] = errand
 
@@ -466,21 +506,32 @@ class _Rendering:
             raise ClusterError(f"a worker lacks a package: {error}") from error
         if not isinstance(error, KilledWorker | MemoryError):
             raise error
+        self.deaths[errand] += 1
+        if isinstance(error, KilledWorker) and not self.lacked_memory(error):
+            if self.deaths[errand] <= TRIALS:  # as workers may be killed for any reason
+                self.submit(errand)
+                return
         unit = errand.unit
         halves = unit.halves() if len(errand.place) < HALVINGS else None
         if halves is None:
             raise ClusterError(
-                f"workers have died of unit {unit.index} even with {unit.spp} samples in each of "
-                f"{unit.tile.pixels} pixels, most likely as the scene needs more memory than they "
-                "have: give them more (--memory-limit), use fewer workers, or --trim"
+                f"workers die of no more than {unit.spp * unit.tile.pixels} samples, most likely "
+                "as the scene needs more memory than they have: give them more (--memory-limit), "
+                "use fewer workers, or --trim"
             ) from error
         self.tell_once(
-            f"unit {unit.index} was too much for a worker's memory: halved, so that the noise of "
-            "the image is another, of the same size"
+            "a unit was too much for a worker's memory: halved, so that the noise of the image is "
+            "another, of the same size"
         )
         self.halves.setdefault(unit.index, {})
         for number, half in enumerate(halves):
             self.submit(_Errand(half, (*errand.place, number)))
+
+    def lacked_memory(self, error: Exception) -> bool:
+        """Whether the worker that has died last was ended for its use of memory."""
+        with _connected():
+            events = self.client.get_events("worker-restart-memory")
+        return any(event.get("worker") == error.last_worker.address for _, event in events)
 
     def joined(self, errand: _Errand, answer: Answer) -> tuple[Unit, Tile, np.ndarray] | None:
         """Add a half to its unit; the unit, if it is whole then.
