@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.errors import check_choice
+from glintbsdf.core.opaque import opaque
 from glintbsdf.footprint.gaussian import Footprint
 
 KERNELS = ("gaussian", "disk", "box")
@@ -138,7 +139,8 @@ class TexelKernel:
         else:
             period = 2 if wrap_mode == "mirror" else 1
             uv = uv - period * dr.floor(uv * (1 / period))
-        size = mi.Vector2f(width, height)
+        # Kernels are the same for maps of all sizes.
+        size = mi.Vector2f(*(opaque(mi.Float, count) for count in (width, height)))
         self.mean = mi.Point2f(dr.fma(uv, size, -0.5))
 
         du, dv = limit_extent(footprint.du, footprint.dv)

@@ -7,6 +7,8 @@ finite rectangle of quads, and this module says which of them a quad of the plan
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -47,6 +49,16 @@ class LatticeAxis:
             self.source = np.arange(self.quads + 1) % self.quads
         self.blocks = -(-self.quads // block)
 
+    @cached_property
+    def count(self) -> mi.Int:
+        """``quads`` for kernels, which are the same for maps of all sizes."""
+        return dr.opaque(mi.Int, self.quads)
+
+    @cached_property
+    def inverse_count(self) -> mi.Float:
+        """1/``quads`` for kernels."""
+        return dr.opaque(mi.Float, 1 / self.quads)
+
     def locate(self, x):
         """Where the quad at the position ``x`` (``mi.Int``, texels) is stored.
 
@@ -54,15 +66,15 @@ class LatticeAxis:
         and all of [``index``, ``end``) is stored from this origin on without a break.
         """
         if not self.clamped:
-            origin = floor_int((mi.Float(x) + 0.5) * (1 / self.quads)) * self.quads
-            return origin, x - origin, mi.Int(self.quads)
+            origin = floor_int((mi.Float(x) + 0.5) * self.inverse_count) * self.count
+            return origin, x - origin, mi.Int(self.count)
         block = self.block
-        last = self.quads - block
+        last = self.count - block
         x = x + block
         before, after = x < 0, x >= last
         beyond = dr.select(before, x, dr.select(after, x - last, 0))
         origin = beyond & -block  # whole blocks, rounded down
-        end = dr.select(before, block, dr.select(after, self.quads, last))
+        end = dr.select(before, block, dr.select(after, self.count, last))
         return origin - block, x - origin, end
 
     def touched_blocks(self, first: int, last: int) -> tuple[int, int]:
@@ -89,7 +101,7 @@ class LatticeAxis:
         """Where the quad after ``x`` is stored, given where ``x`` is."""
         if self.clamped:
             return self.locate(x + 1)[1]
-        return dr.select(index == self.quads - 1, 0, index + 1)
+        return dr.select(index == self.count - 1, 0, index + 1)
 
 
 class Lattice:
@@ -111,9 +123,15 @@ class Lattice:
         columns = np.resize(self.x.source, 4 * tiles[1]).reshape(1, tiles[1], 1, 4)
         self.source = (rows * width + columns).astype(np.uint32).ravel()
 
+    @cached_property
+    def row_pitch(self) -> mi.UInt32:
+        """``pitch`` for kernels."""
+        return dr.opaque(mi.UInt32, self.pitch)
+
     def corners(self, row, column):
         """Indices of the four vertices n0, n1, n2, n3 of a stored quad (``mi.UInt32``)."""
-        upper, lower = ((i >> 1) * self.pitch + ((i & 1) << 2) for i in (row, row + 1))
+        row, column = mi.UInt32(row), mi.UInt32(column)
+        upper, lower = ((i >> 1) * self.row_pitch + ((i & 1) << 2) for i in (row, row + 1))
         left, right = (((j >> 2) << 3) + (j & 3) for j in (column, column + 1))
         return upper + left, upper + right, lower + left, lower + right
 

@@ -549,8 +549,8 @@ class Elements(Mixture):
 
         In the margin the cells at its border are found: of a flat map, all that is beyond reach.
         """
-        columns = self.lattice.x.quads
-        index = dr.arange(mi.UInt32, columns * self.lattice.y.quads)
+        index = dr.arange(mi.UInt32, self.lattice.x.quads * self.lattice.y.quads)
+        columns = mi.UInt32(self.lattice.x.count)
         boxes = map(BlocksOfEllipses.extent, self.ellipses(index // columns, index % columns))
         lower, upper = zip(*boxes, strict=True)
         margin = 1.5 * self.sigma_r

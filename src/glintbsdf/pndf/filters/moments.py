@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from math import ceil, floor, log2, sqrt
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import opaque
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
@@ -142,12 +143,28 @@ class SampleAxis:
     spacing: float
     periodic: bool
 
+    @cached_property
+    def samples(self) -> mi.Int:
+        """``count`` for kernels, which are the same for maps of all sizes."""
+        return opaque(mi.Int, self.count)
+
+    @cached_property
+    def inverse_count(self) -> mi.Float:
+        """1/``count`` for kernels."""
+        return opaque(mi.Float, 1 / self.count)
+
+    def divided(self, index):
+        """Row and column (``mi.UInt32``) of an index to rows of ``count`` samples."""
+        columns = mi.UInt32(self.samples)
+        row = index // columns
+        return row, index - row * columns
+
     def wrapped(self, index):
         """The sample that stands at any ``mi.Int`` index."""
         if self.periodic:
-            turns = floor_int((mi.Float(index) + 0.5) * (1 / self.count))
-            return mi.UInt32(index - turns * self.count)
-        return mi.UInt32(dr.clip(index, 0, self.count - 1))
+            turns = floor_int((mi.Float(index) + 0.5) * self.inverse_count)
+            return mi.UInt32(index - turns * self.samples)
+        return mi.UInt32(dr.clip(index, 0, self.samples - 1))
 
 
 def level_axis(texels: int, spacing: float, periodic: bool) -> SampleAxis:
@@ -180,20 +197,20 @@ def smooth(
     """
     source, other = axes[along], axes[1 - along]
     sample = dr.arange(mi.UInt32, target.count * other.count)
-    columns = target.count if along == 1 else other.count
-    row, column = sample // columns, sample % columns
+    row, column = (target if along == 1 else other).divided(sample)
     index, kept = (column, row) if along == 1 else (row, column)
 
     # Opaque, so that one kernel serves many levels.
-    step = dr.opaque(mi.Float, target.spacing / source.spacing)
-    first = dr.opaque(mi.Float, (target.origin - source.origin) / source.spacing)
-    sharpness = dr.opaque(mi.Float, source.spacing**2 / (2 * variance))
+    step = opaque(mi.Float, target.spacing / source.spacing)
+    first = opaque(mi.Float, (target.origin - source.origin) / source.spacing)
+    sharpness = opaque(mi.Float, source.spacing**2 / (2 * variance))
     place = dr.fma(mi.Float(index), step, first)
     nearest = floor_int(place + 0.5)
 
     def sample_at(offset: int) -> list:
         taken = source.wrapped(nearest + offset)
-        position = kept * source.count + taken if along == 1 else taken * other.count + kept
+        columns = mi.UInt32((source if along == 1 else other).samples)
+        position = kept * columns + taken if along == 1 else taken * columns + kept
         return [dr.gather(mi.Float, channel, position) for channel in channels]
 
     origin = origin_of(sample_at(0), spread)
@@ -214,10 +231,9 @@ def all_texels(normals, texels: tuple[SampleAxis, SampleAxis], axes: tuple[Sampl
     """The normals (``mi.Vector2f``) at the samples of ``axes``, which are texels."""
     index = dr.arange(mi.UInt32, axes[0].count * axes[1].count)
     row, column = (
-        mi.Int(i) + int(axis.origin)
-        for i, axis in zip((index // axes[1].count, index % axes[1].count), axes, strict=True)
+        mi.Int(i) + int(axis.origin) for i, axis in zip(axes[1].divided(index), axes, strict=True)
     )
-    index = texels[0].wrapped(row) * texels[1].count + texels[1].wrapped(column)
+    index = texels[0].wrapped(row) * mi.UInt32(texels[1].samples) + texels[1].wrapped(column)
     return dr.gather(mi.Vector2f, normals, index)
 
 
@@ -236,13 +252,13 @@ def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAx
     index = dr.arange(mi.UInt32, quads[0].count * quads[1].count)
     row, column = (
         mi.Int(i) if axis.periodic else mi.Int(i) - 1
-        for i, axis in zip((index // quads[1].count, index % quads[1].count), axes, strict=True)
+        for i, axis in zip(quads[1].divided(index), axes, strict=True)
     )
     corners = [
         dr.gather(
             mi.Vector2f,
             normals,
-            axes[0].wrapped(row + i) * axes[1].count + axes[1].wrapped(column + j),
+            axes[0].wrapped(row + i) * mi.UInt32(axes[1].samples) + axes[1].wrapped(column + j),
         )
         for i in (0, 1)
         for j in (0, 1)
@@ -297,9 +313,11 @@ def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
     if window == tuple((0, axis.count) for axis in axes):
         return level
     index = dr.arange(mi.UInt32, rows * columns)
-    row = axes[0].wrapped(top + mi.Int(index // columns))
-    column = axes[1].wrapped(left + mi.Int(index % columns))
-    index = row * axes[1].count + column
+    columns = opaque(mi.UInt32, columns)
+    row = index // columns
+    column = axes[1].wrapped(opaque(mi.Int, left) + mi.Int(index - row * columns))
+    row = axes[0].wrapped(opaque(mi.Int, top) + mi.Int(row))
+    index = row * mi.UInt32(axes[1].samples) + column
     return [dr.gather(mi.Float, channel, index) for channel in level]
 
 
@@ -463,10 +481,12 @@ class MomentPyramid:
         if self.wrap_mode != "mirror":
             return data.array, self.height, self.width
         index = dr.arange(mi.UInt32, 4 * self.height * self.width)
-        row, column = index // (2 * self.width), index % (2 * self.width)
-        row = dr.minimum(row, 2 * self.height - 1 - row)
-        column = dr.minimum(column, 2 * self.width - 1 - column)
-        mirrored = dr.gather(mi.Vector2f, data.array, row * self.width + column)
+        height, width = (opaque(mi.UInt32, n) for n in (self.height, self.width))
+        row = index // (2 * width)
+        column = index - row * (2 * width)
+        row = dr.minimum(row, 2 * height - 1 - row)
+        column = dr.minimum(column, 2 * width - 1 - column)
+        mirrored = dr.gather(mi.Vector2f, data.array, row * width + column)
         return dr.ravel(mirrored), 2 * self.height, 2 * self.width
 
     def store(
@@ -522,7 +542,8 @@ class MomentPyramid:
         major, variance_major, variance_minor = principal_axes(kernel)
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
         variance, step, steps, sharpness = taps(variance_major, variance)
-        level = dr.clip(level_below(variance), self.first, self.top - 1)
+        last = opaque(mi.Float, self.top - 1)
+        level = dr.clip(level_below(variance), opaque(mi.Float, self.first), last)
         grids = [self.grid(level), self.grid(level + 1)]
         steps = dr.select(active, steps, -1)  # none at all, as they go from −steps to steps
         step = major * step
@@ -541,7 +562,7 @@ class MomentPyramid:
 
     def grid(self, level) -> LevelSamples:
         """The samples of a level (``mi.Float``)."""
-        index = mi.UInt32(level - self.first)
+        index = mi.UInt32(level - opaque(mi.Float, self.first))
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
         return LevelSamples(

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import aligned
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
@@ -169,6 +170,11 @@ class NormalCells:
         self.lower, self.upper = (np.asarray(v, np.float32) for v in (lower, upper))
         self.divisions = len(cell_of_y)
         self.scale = (RESOLUTION / (self.upper - self.lower)).astype(np.float32)
+        # For kernels, which are the same for all maps.
+        self.origin, self.pixels = (
+            [dr.opaque(mi.Float, float(x)) for x in values] for values in (self.lower, self.scale)
+        )
+        self.count = dr.opaque(mi.UInt32, self.divisions)
         self.slab_of_x = mi.UInt32(slab_of_x.astype(np.uint32))
         self.cell_of_y = mi.UInt32(cell_of_y.astype(np.uint32).ravel())
 
@@ -197,7 +203,7 @@ class NormalCells:
 
     def pixel(self, value, axis):
         """Position of a coordinate in the table, in pixels."""
-        return (value - self.lower[axis]) * self.scale[axis]
+        return (value - self.origin[axis]) * self.pixels[axis]
 
     def covers(self, m):
         """Whether ``m`` lies in the rectangle."""
@@ -215,7 +221,7 @@ class NormalCells:
     def cell(self, m, active=True):
         """Index of the cell of ``m``."""
         slab = self.slab(m.x, active)
-        return slab * self.divisions + self.cell_in_slab(slab, m.y, active)
+        return slab * self.count + self.cell_in_slab(slab, m.y, active)
 
     def edges(self) -> tuple[mi.Float, mi.Float]:
         """Lower edges of the slabs (S + 1), and of the cells of each slab (S, S + 1), flat."""
@@ -239,17 +245,18 @@ class Span(NamedTuple):
 
     def place(self, block):
         """Which of the span a block is (``mi.UInt32``)."""
-        place = block - self.first
-        if self.first + self.count > self.all:
-            place = dr.select(block < self.first, place + self.all, place)
-        return place
+        if self.count == self.all and self.first == 0:
+            return block
+        first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
+        return dr.select(block < first, block + all, block) - first
 
     def block(self, place):
         """The block at a place of the span (``mi.UInt32``)."""
-        block = place + self.first
-        if self.first + self.count > self.all:
-            block = dr.select(block >= self.all, block - self.all, block)
-        return block
+        if self.count == self.all and self.first == 0:
+            return place
+        first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
+        block = place + first
+        return dr.select(block >= all, block - all, block)
 
 
 class Window(NamedTuple):
@@ -306,7 +313,7 @@ class QuadLists:
         it returns the new ``density``. Sums are differentiable in both modes.
         """
         rows, columns = self.window
-        count, width = self.cells.divisions**2, columns.count + 1
+        count, width = dr.square(self.cells.count), dr.opaque(mi.UInt32, columns.count + 1)
         cell = self.cells.cell(m, active)
 
         def run_of(block_row, first, last, active):
@@ -403,7 +410,8 @@ class BlocksOfQuads(Blocks):
         """Whether the ``quad``-th of a block exists, and its shapes."""
         row = self.window.rows.block(block_row) * BLOCK + (quad >> SHIFT)
         column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
-        exists = active & (row < self.lattice.y.quads) & (column < self.lattice.x.quads)
+        exists = active & (mi.Int(row) < self.lattice.y.count)
+        exists &= mi.Int(column) < self.lattice.x.count
         return exists, self.shapes_of_quad(row, column, exists)
 
     def entry(self, block_row, block_column, quad):
@@ -474,7 +482,9 @@ class Builder:
         """Memory of the lists with so many divisions, estimated from a sample of blocks."""
         self.use(divisions)
         sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
-        row, column = (mi.UInt32(v) for v in divmod(sample, self.columns))
+        row, column = (
+            mi.UInt32(aligned(v.astype(np.uint32))) for v in divmod(sample, self.columns)
+        )
         counter = dr.zeros(mi.UInt32, 1)
         self.scan(row, column, lambda cell: mi.UInt32(0), counter)
         entries = counter[0] / (len(sample) * self.blocks.mean_count)
@@ -489,13 +499,16 @@ class Builder:
         """
         shape = counters.shape
         block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
-        row, column = block // self.columns, block % self.columns
-        counters = mi.UInt32(counters.ravel())
+        columns = dr.opaque(mi.UInt32, self.columns)
+        row = block // columns
+        column = block - row * columns
+        cells, width = (dr.opaque(mi.UInt32, n) for n in shape[1:])
+        counters = mi.UInt32(aligned(counters.ravel()))
         filled = None if entries is None else dr.zeros(mi.UInt32, max(int(entries), 1))
         self.scan(
             row + dr.opaque(mi.UInt32, strip.start),
             column,
-            lambda cell: (row * shape[1] + cell) * shape[2] + column,
+            lambda cell: (row * cells + cell) * width + column,
             counters,
             filled,
         )
@@ -538,13 +551,13 @@ class Builder:
             inside = active & (slab <= last_slab)
             s, c = mi.UInt32(slab), mi.UInt32(cell)
             x = [dr.gather(mi.Float, self.slab_edges, s + k, inside) for k in range(2)]
-            index = s * (cells.divisions + 1) + c
+            index = s * (cells.count + 1) + c
             y = [dr.gather(mi.Float, self.cell_edges, index + k, inside) for k in range(2)]
             centre = mi.Vector2f(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
             half = mi.Vector2f(0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])) + MARGIN
             met = reduce(or_, (blocks.meets(shape, centre, half) for shape in shapes))
             found = inside & met
-            slot = dr.scatter_inc(counters, counter_of_cell(s * cells.divisions + c), found)
+            slot = dr.scatter_inc(counters, counter_of_cell(s * cells.count + c), found)
             if entries is not None:
                 dr.scatter(entries, blocks.entry(block_row, block_column, quad), slot, found)
 

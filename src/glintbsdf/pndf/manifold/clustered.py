@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check
+from glintbsdf.core.opaque import opaque
 from glintbsdf.core.progress import progress
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
@@ -195,7 +196,8 @@ class ClusterLattice:
         ``level``: a number ≥ 1, or one per lane, where 0 gives no index.
         """
         if isinstance(level, int):
-            (rows, columns), first = self.shapes[level], self.first[level]
+            numbers = self.first[level], *self.shapes[level]
+            first, rows, columns = (opaque(mi.UInt32, n) for n in numbers)
         else:
             first, rows, columns = (dr.gather(mi.UInt32, table, level) for table in self.tables)
         i, j = mi.UInt32(row) >> level, mi.UInt32(column) >> level
@@ -206,7 +208,7 @@ class CellsOfRung(NormalCells):
     """The cells of normals of one rung per lane, see :class:`Ladder`."""
 
     def __init__(self, ladder: Ladder, rung, active) -> None:
-        self.lower, self.scale = ladder.lower, ladder.scale
+        self.origin, self.pixels = ladder.origin, ladder.pixels
         self.divisions = dr.gather(mi.UInt32, ladder.divisions, rung, active)
         self.slab_of_x, self.cell_of_y = ladder.slab_of_x, ladder.cell_of_y
         self.begin = ladder.begin("slab_of_x", rung, active)
@@ -253,8 +255,11 @@ class Ladder:
             mi.UInt32(arrays["divisions"]),
             mi.UInt32(arrays["begin"].ravel()),
         )
-        self.lower = arrays["lower"]
-        self.scale = (RESOLUTION / (arrays["upper"] - self.lower)).astype(np.float32)
+        lower = arrays["lower"]
+        scale = (RESOLUTION / (arrays["upper"] - lower)).astype(np.float32)
+        self.origin, self.pixels = (
+            [opaque(mi.Float, float(x)) for x in values] for values in (lower, scale)
+        )
 
     @property
     def nbytes(self) -> int:
@@ -276,7 +281,7 @@ class Ladder:
         """The rung for r_x r_y τ = ``allowed``; 0: no clusters."""
         rung = mi.UInt32(0)
         for threshold in self.thresholds:
-            rung = dr.select(allowed >= threshold, rung + 1, rung)
+            rung = dr.select(allowed >= opaque(mi.Float, threshold), rung + 1, rung)
         return rung
 
     def level_at(self, row, column, rung, active):
@@ -306,7 +311,7 @@ class Ladder:
         # Slabs are numbered through all rungs, RESOLUTION entries of ``cell_of_y`` each.
         slab = slab - self.begin("cell_of_y", rung, active) // RESOLUTION
         shift = dr.gather(mi.UInt32, self.shifts, rung, active)
-        columns = ((self.lattice.x.quads - 1) >> shift) + 2  # of the table of offsets
+        columns = ((mi.UInt32(self.lattice.x.count) - 1) >> shift) + 2  # of the table of offsets
         start, offset, first_of_row = (
             self.begin(name, rung, active) for name in ("start", "offset", "first_of_row")
         )
@@ -531,10 +536,12 @@ class ClusteredManifold(Manifold):
         quad = level == 0
         surplus = self.clusters.surplus
         quad_row, quad_column = (
-            dr.clip(i - surplus, 0, axis.quads - 1) if surplus else i
+            dr.clip(i - surplus, 0, axis.count - 1) if surplus else i
             for i, axis in ((row, self.lattice.y), (column, self.lattice.x))
         )
-        index = self.quad_vertices + 4 * self.clusters.cluster(row, column, level)[0]
+        index = (
+            opaque(mi.UInt32, self.quad_vertices) + 4 * self.clusters.cluster(row, column, level)[0]
+        )
         return [
             dr.gather(
                 mi.Vector2f, self.vertices, dr.select(quad, mi.UInt32(corner), index + k), active

@@ -392,7 +392,9 @@ class ProjectedArea(FootprintArea):
         with dr.suspend_grad():
             lattice = self.mesh.lattice
             index = dr.arange(mi.UInt32, lattice.x.quads * lattice.y.quads)
-            row, column = index // lattice.x.quads, index % lattice.x.quads
+            columns = mi.UInt32(lattice.x.count)
+            row = index // columns
+            column = index - row * columns
             longest = mi.Float(0)
             for triangle in self.triangles(mi.Int(row), mi.Int(column), True):
                 for chord in Corners(*triangle, mi.Vector3f(0, 0, 1)).chords:

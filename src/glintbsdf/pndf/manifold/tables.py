@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.opaque import opaque
 from glintbsdf.core.progress import progress
 from glintbsdf.core.tuning import usable_cores
 from glintbsdf.footprint.lattice import floor_int
@@ -238,6 +239,13 @@ class Bins:
         self.size = np.maximum((upper - self.lower) / BINS, MIN_BIN)
         shape = np.maximum(np.ceil((upper - self.lower) / self.size - 1e-6), 1)
         self.columns, self.rows = (int(n) for n in shape)
+        # For kernels, which are the same for all maps.
+        self.corner, self.extent, self.per_size = (
+            mi.Vector2f(*(opaque(mi.Float, float(x)) for x in values))
+            for values in (self.lower, self.size, 1 / self.size)
+        )
+        self.per_row = opaque(mi.Float, 1 / self.columns)
+        self.shape = mi.Vector2u(*(opaque(mi.UInt32, n) for n in (self.columns, self.rows)))
 
     @property
     def area(self) -> float:
@@ -246,22 +254,22 @@ class Bins:
 
     def place(self, m):
         """Position of a projected normal in the grid, in bins."""
-        return mi.Vector2f(
-            *((m[k] - float(self.lower[k])) * float(1 / self.size[k]) for k in range(2))
-        )
+        return (m - self.corner) * self.per_size
 
     def index(self, m):
         """``(index, inside)`` of the bin of a projected normal."""
         p = self.place(m)
-        inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.columns) & (p.y < self.rows)
+        inside = dr.all((p >= 0) & (p < mi.Vector2f(self.shape)))
         x, y = (mi.UInt32(dr.select(inside, v, 0)) for v in (p.x, p.y))
-        return y * self.columns + x, inside
+        return y * self.shape.x + x, inside
 
     def normal(self, index, jitter):
         """The projected normal at a place ``jitter`` ∈ [0, 1)² in a bin."""
-        place = mi.Vector2f(mi.Float(index % self.columns), mi.Float(index // self.columns))
-        size, lower = (mi.Vector2f(*(float(v) for v in t)) for t in (self.size, self.lower))
-        return lower + size * (place + jitter)
+        # No whole number is divided by a variable: of lanes that call another BSDF it is 0, and the
+        # processor would end the program.
+        row = mi.UInt32((mi.Float(index) + 0.5) * self.per_row)
+        place = mi.Vector2f(mi.Float(index - row * self.shape.x), mi.Float(row))
+        return self.corner + self.extent * (place + jitter)
 
     def spread(self, triangles, row: np.ndarray, column: np.ndarray) -> csr_matrix:
         """How the normals of quads spread over the bins: (quads, bins), every row of sum 1.
@@ -277,7 +285,7 @@ class Bins:
         row, column = (dr.gather(mi.Int, mi.Int(v), lane >> 1) for v in (row, column))
         (a, *first), (b, *second) = triangles(row, column, mi.Bool(True))
         upper = (lane & 1) == 0
-        scale = mi.Vector2f(*(float(1 / size) for size in self.size))
+        scale = self.per_size
         corner = self.place(dr.select(upper, a, b))
         edges = (scale * dr.select(upper, p, q) for p, q in zip(first, second, strict=True))
         corners = [corner, *(corner + edge for edge in edges)]
@@ -285,7 +293,7 @@ class Bins:
 
         y, bottom = (
             dr.clip(floor_int(least(least(*(c.y for c in corners[:2])), corners[2].y)), 0, top)
-            for top in (self.rows - 1,)
+            for top in (mi.Int(self.shape.y) - 1,)
             for least in (dr.minimum, dr.maximum)
         )
 
@@ -304,7 +312,7 @@ class Bins:
         def add_bin(x, last, y, place, total):
             area = clipped_area(corners, mi.Float(x), mi.Float(y))
             dr.scatter(part, area, place)
-            dr.scatter(bins, y * self.columns + x, place)
+            dr.scatter(bins, y * mi.Int(self.shape.x) + x, place)
             new_row = x >= last
             y = dr.select(new_row, y + 1, y)
             start, stop = self.columns_of(corners, mi.Float(y))
@@ -337,7 +345,8 @@ class Bins:
             highest = dr.select(meets, dr.maximum(highest, dr.maximum(from_x, to_x)), highest)
         margin = 1e-4  # bins
         return tuple(
-            dr.clip(floor_int(v), 0, self.columns - 1) for v in (lowest - margin, highest + margin)
+            dr.clip(floor_int(v), 0, mi.Int(self.shape.x) - 1)
+            for v in (lowest - margin, highest + margin)
         )
 
 
@@ -416,7 +425,9 @@ class NormalTables:
         count_y, count_x = (dr.gather(mi.Int, n, level) for n in (self.count_y, self.count_x))
         tiles_y, tiles_x = ((mi.UInt32(n) + (TILE - 1)) // TILE for n in (count_y, count_x))
         word = dr.gather(mi.UInt32, self.first_word, level) + row * tiles_y * tiles_x
-        start = dr.gather(mi.UInt32, self.starts, level * self.filled + row, active)
+        start = dr.gather(
+            mi.UInt32, self.starts, level * opaque(mi.UInt32, self.filled) + row, active
+        )
         return word, tiles_x, start
 
     def value(self, table, y, x, active):

@@ -27,6 +27,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import opaque
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
@@ -112,7 +113,8 @@ class TabulatedManifold(Manifold):
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
         mean = dr.sqrt(kernel.sigma_u_given_v * kernel.sigma_v)
         tables = self.tables
-        nodes = tables.grains[level][KERNELS.index(self.kernel)], tables.spacing(level)
+        grains = tables.grains[level][KERNELS.index(self.kernel)]
+        nodes = [opaque(mi.Float, x) for x in grains], opaque(mi.Float, tables.spacing(level))
         minor = dr.sqrt(kernel.minor_variance)
         return predicted(self.kernel, *nodes, tables.mixed[level], minor, mean)
 
@@ -147,7 +149,8 @@ class TabulatedManifold(Manifold):
         """The level for a kernel, see :meth:`level`."""
         level = mi.Int(-1)
         for k, variances in enumerate(self.tables.variances):
-            room = max(variances) <= MAX_NARROWING * VARIANCE[self.kernel] * kernel.minor_variance
+            variance = opaque(mi.Float, max(variances))
+            room = variance <= MAX_NARROWING * VARIANCE[self.kernel] * kernel.minor_variance
             fits = room & (self.error(kernel, k) <= self.max_error)
             level = dr.select(fits, k, level)
         return level
@@ -178,7 +181,8 @@ class TabulatedManifold(Manifold):
         """What :meth:`node_kernel` returns."""
         tables, level = self.tables, self.level(query)
         nodes = [
-            mi.Float(n) / p for n, p in zip(self.counts_of(level), tables.periods, strict=True)
+            mi.Float(n) * opaque(mi.Float, 1 / p)
+            for n, p in zip(self.counts_of(level), tables.periods, strict=True)
         ]
         index = mi.UInt32(dr.maximum(level, 0))
         added = (
@@ -190,8 +194,8 @@ class TabulatedManifold(Manifold):
         kernel = TexelKernel(
             self.kernel,
             query.footprint,
-            height * nodes[0],
-            width * nodes[1],
+            opaque(mi.Float, height) * nodes[0],
+            opaque(mi.Float, width) * nodes[1],
             self.normal_map.wrap_mode,
             tuple(added),
         )
@@ -258,7 +262,7 @@ class TabulatedManifold(Manifold):
             return mass + masses, total + weights
 
         mass, total = self.every_node(kernel, found, add, mi.Float(0), mi.Float(0))
-        return exact + dr.select(found & (total > 0), mass / (total * tables.bins.area), 0)
+        return exact + dr.select(found & (total > 0), mass / (total * opaque(mi.Float, tables.bins.area)), 0)
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
@@ -305,9 +309,10 @@ class TabulatedManifold(Manifold):
         )
         for count, index, axis, fine, u in axes:
             # The function of a node is a spline, or one of some finer splines at random.
+            fine = opaque(mi.Int, fine)
             between = 3 * count == 2 * fine
             index = dr.select(between, finer_node(index, u[3]), index)
-            spacing = axis.quads / mi.Float(dr.select(between, fine, count))
+            spacing = mi.Float(axis.count) / mi.Float(dr.select(between, fine, count))
             # A quadratic B-spline is the distribution of a sum of three uniform numbers.
             place = (mi.Float(index) - 1 + u[0] + u[1] + u[2]) * spacing
             quad.append(axis.locate(floor_int(place))[1])

@@ -1,0 +1,116 @@
+"""Nothing of a map is written into kernels: the second map of a scene compiles nothing anew."""
+
+from __future__ import annotations
+
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from glintbsdf import maps
+
+METHODS = [
+    ("glint_manifold", {}),
+    ("glint_manifold", {"masking": "none"}),
+    ("glint_manifold", {"masking": "beckmann"}),
+    ("glint_manifold", {"masking": "none", "max_error": 0.1}),
+    ("glint_manifold", {"masking": "none", "threshold": 0.01}),
+    ("glint_elements", {}),
+    ("glint_filtered", {}),
+    ("glint_diffuse", {}),
+]
+
+
+def a_map(size: int = 64) -> np.ndarray:
+    """One that no earlier run has seen, as kernels are kept on disk. All are about as steep: by that
+    quadratures and levels of tables are chosen."""
+    rng = np.random.default_rng()
+    alpha, length = rng.uniform(0.09, 0.11), rng.uniform(5, 7)
+    seed = int(rng.integers(1 << 30))
+    return maps.isotropic(
+        size, alpha=float(alpha), correlation_length=float(length), seed=seed
+    ).normals
+
+
+def plate(plugin: str, options: dict, size: int = 64) -> mi.Scene:
+    camera = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 8}
+    bsdf = {"type": plugin, "data": mi.TensorXf(a_map(size)), "pixel_spread": 0.01, **options}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 2},
+            "sensor": {"type": "perspective", "to_world": camera, "film": film},
+            "light": {"type": "point", "position": [0.3, 0, 4], "intensity": 20.0},
+            "plate": {"type": "rectangle", "bsdf": bsdf},
+        }
+    )
+
+
+def compiled(action) -> int:
+    """How many kernels an action compiles."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        action()
+        dr.sync_thread()
+        history = dr.kernel_history()
+    return sum(not kernel.get("cache_hit", True) for kernel in history)
+
+
+@pytest.mark.parametrize(("plugin", "options"), METHODS, ids=str)
+def test_another_map_compiles_nothing(variant, monkeypatch, plugin, options):
+    monkeypatch.setenv("GLINTBSDF_CACHE", "off")  # building is part of it
+
+    def show():
+        np.array(mi.render(plate(plugin, options), spp=1))
+
+    counts = [compiled(show) for _ in range(3)]
+    assert counts[2] == 0, counts
+
+
+@pytest.mark.parametrize(
+    ("plugin", "options"),
+    [("glint_manifold", {}), ("glint_elements", {}), ("glint_diffuse", {})],
+    ids=str,
+)
+def test_maps_of_other_sizes_share_kernels(variant, monkeypatch, plugin, options):
+    monkeypatch.setenv("GLINTBSDF_CACHE", "off")
+    sizes = iter((64, 80, 48))
+
+    def show():
+        np.array(mi.render(plate(plugin, options, next(sizes)), spp=1))
+
+    counts = [compiled(show) for _ in range(3)]
+    assert counts[2] == 0, counts
+
+
+@pytest.mark.parametrize(("plugin", "options"), METHODS[1:2] + METHODS[5:], ids=str)
+def test_another_data_compiles_nothing(variant, plugin, options):
+    scene = plate(plugin, options)
+    params = mi.traverse(scene)
+    (key,) = (key for key in params.keys() if key.endswith(".data"))
+
+    def update():
+        params[key] = mi.TensorXf(np.array(params[key]) * np.float32(0.97))
+        params.update()
+        np.array(mi.render(scene, spp=1))
+
+    counts = [compiled(update) for _ in range(3)]
+    assert counts[2] == 0, counts
+
+
+@pytest.mark.parametrize(("plugin", "options"), METHODS[:1] + METHODS[5:], ids=str)
+def test_bsdfs_go_with_their_scenes(variant, plugin, options):
+    """At once, without the garbage collector: a cycle would keep maps and kernels alive."""
+    from glintbsdf.bridge.bsdf import FootprintBSDF  # of the active variant
+
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(3):
+            np.array(mi.render(plate(plugin, options), spp=1))
+        assert not any(isinstance(thing, FootprintBSDF) for thing in gc.get_objects())
+    finally:
+        gc.enable()
