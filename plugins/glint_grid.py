@@ -135,6 +135,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Grid
 from glintbsdf.pndf.grid.microdetails import Palette, Wheel
@@ -154,9 +155,18 @@ class GlintGrid(GlintBSDF):
             colors = {"none": None, "wheel": Wheel()}[colors]
         else:
             colors = Palette(colors)
+        alpha = parameters.per_axis("alpha", 0.3)
+        detail_alpha = parameters.per_axis("detail_alpha", 0.05)
+        for axis, whole, detail in zip("uv", alpha, detail_alpha, strict=True):
+            names = parameters.written("alpha", axis), parameters.written("detail_alpha", axis)
+            if names[1] in props:
+                requirement = f'at most "{names[0]}" = {whole:g}'
+                check(detail <= whole, self.owner, names[1], requirement, detail)
+            requirement = f'at least "{names[1]}" = {detail:g}'
+            check(detail <= whole, self.owner, names[0], requirement, whole)
         self.options = {
-            "alpha": parameters.per_axis("alpha", 0.3),
-            "detail_alpha": parameters.per_axis("detail_alpha", 0.05),
+            "alpha": alpha,
+            "detail_alpha": detail_alpha,
             "density": parameters.number("density", 8.0),
             "size_variation": parameters.number("size_variation", 0.3),
             "intensity": parameters.number("intensity", 1.0),

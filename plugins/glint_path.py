@@ -124,7 +124,7 @@ import mitsuba as mi
 from glintbsdf.bridge import filter_sampling
 from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.bridge.separation import smooth_context
-from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.errors import check, check_choice, check_whole
 from glintbsdf.footprint.pixel_filter import (
     LEAST_VARIANCE,
     PIXEL_SIGMA,
@@ -146,8 +146,10 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         pixel_share = props.get("pixel_share", "auto")
         emitters = props.get("emitters", "all")
         owner = props.plugin_name()
-        check(max_depth >= -1, owner, "max_depth", "-1 (infinite) or a value >= 0", max_depth)
-        check(rr_depth > 0, owner, "rr_depth", "greater than zero", rr_depth)
+        check_whole(
+            max_depth, lambda d: d in range(-1, 2**31), owner, "max_depth", "≥ -1 (infinite)"
+        )
+        check_whole(rr_depth, lambda d: d in range(1, 2**31), owner, "rr_depth", "> 0")
         check(isinstance(separate, bool), owner, "separate", "true or false", separate)
         check_share(owner, "pixel_share", pixel_share)
         check_choice(owner, "emitters", emitters, ("all", "one"))
@@ -411,7 +413,7 @@ def check_share(owner: str, name: str, value: object) -> None:
     """Raise :class:`~.ParameterError` unless ``value`` is a share."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     check(
-        value == "auto" or (number and 0 <= value <= 1),
+        (isinstance(value, str) and value == "auto") or (number and 0 <= value <= 1),
         owner,
         name,
         "auto or a number in [0, 1]",

@@ -24,8 +24,10 @@ METHODS = [
 
 
 def a_map(size: int = 64) -> np.ndarray:
-    """One that no earlier run has seen, as kernels are kept on disk. All are about as steep: by that
-    quadratures and levels of tables are chosen."""
+    """One that no earlier run has seen, as kernels are kept on disk.
+
+    All are about as steep: by that quadratures and levels of tables are chosen.
+    """
     rng = np.random.default_rng()
     alpha, length = rng.uniform(0.09, 0.11), rng.uniform(5, 7)
     seed = int(rng.integers(1 << 30))

@@ -77,6 +77,7 @@ TENSOR = Kind("a tensor")
 TRANSFORM = Kind("a transform")
 SPECTRUM = Kind("a number, colour, spectrum or texture")
 INDEX = Kind("a number or the name of a material")
+SHARE = Kind("auto or a number from 0 to 1")
 COLORS = Kind("a name, an image file or an mi.Bitmap")
 
 #: Indices of refraction, and their imaginary part: Fresnel's equations take their fourth power.
@@ -178,6 +179,14 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         "max_anisotropy": Number(1, 1024),
         "seed": _SEED,
     },
+    "glint_path": {
+        "max_depth": Number(-1, 2**31 - 1, whole=True),
+        "rr_depth": Number(1, 2**31 - 1, whole=True),
+        "hide_emitters": FLAG,
+        "separate": FLAG,
+        "pixel_share": SHARE,
+        "emitters": NAME,
+    },
 }
 
 
@@ -231,6 +240,10 @@ class Parameters:
         if name in self.props:
             default = self.number(name, default)
         return tuple(self.number(axis, default) for axis in axes)
+
+    def written(self, name: str, axis: str) -> str:
+        """How a parameter of an axis was written: ``name`` for both, or ``name_u``, ``name_v``."""
+        return name if name in self.props else f"{name}_{axis}"
 
     def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
         """One of the strings ``choices``."""

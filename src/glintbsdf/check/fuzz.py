@@ -204,8 +204,11 @@ def base(plugin: str) -> dict:
     return description
 
 
-def outcome(case: Case) -> str:
-    """What comes of a case: one of :data:`GOOD`, or a sentence about the fault."""
+def outcome(case: Case, evaluate: bool = True) -> str:
+    """What comes of a case: one of :data:`GOOD`, or a sentence about the fault.
+
+    ``evaluate``: whether a BSDF that loads is evaluated as well, for which kernels are compiled.
+    """
     import mitsuba as mi
 
     description = base(case.plugin)
@@ -220,7 +223,8 @@ def outcome(case: Case) -> str:
     except Exception as error:
         return judged(case, str(error))
     try:
-        return "used" if not hasattr(loaded, "eval_pdf") else judged_values(loaded)
+        evaluate = evaluate and hasattr(loaded, "eval_pdf")
+        return judged_values(loaded) if evaluate else "used"
     except Exception as error:
         return f"evaluation fails: {type(error).__name__}: {str(error)[-300:]}"
 
@@ -234,6 +238,8 @@ def judged(case: Case, message: str) -> str:
         return (
             "refused by Mitsuba" if named or "nstantiat" not in message else "other: " + lines[-1]
         )
+    if any(f'The property "{name}" has the wrong type' in lines[-1] for name in case.changes):
+        return "refused by Mitsuba"  # of a parameter that its base class reads
     told = [line for line in lines if re.search(rf"{case.plugin}: ", line)]
     if len(told) != 1:
         return "no sentence: " + lines[-1]

@@ -262,7 +262,9 @@ class TabulatedManifold(Manifold):
             return mass + masses, total + weights
 
         mass, total = self.every_node(kernel, found, add, mi.Float(0), mi.Float(0))
-        return exact + dr.select(found & (total > 0), mass / (total * opaque(mi.Float, tables.bins.area)), 0)
+        return exact + dr.select(
+            found & (total > 0), mass / (total * opaque(mi.Float, tables.bins.area)), 0
+        )
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool

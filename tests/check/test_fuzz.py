@@ -1,0 +1,48 @@
+"""Values of every kind for every parameter: used, or refused in one sentence that names them."""
+
+from __future__ import annotations
+
+import pytest
+
+from glintbsdf.bridge.parameters import PARAMETERS
+from glintbsdf.bridge.registration import plugin_types
+from glintbsdf.check.fuzz import GOOD, Case, Report, cases, fuzz, judged, outcome
+
+
+def test_cases_follow_their_seed():
+    first, again, other = ([str(c) for c in cases(seed, 50)] for seed in (1, 1, 2))
+    assert first == again != other
+    assert {case.plugin for case in cases(1, 500)} == set(PARAMETERS)
+
+
+def test_every_plugin_declares_its_parameters():
+    assert set(plugin_types()) == set(PARAMETERS)
+
+
+def test_every_value_is_used_or_refused(variant):
+    report = Report()
+    for case in cases(3, 600):
+        report.add(case, outcome(case, evaluate=False))
+    assert not report.faults, str(report)
+    assert report.counts["refused"] > 300 and report.counts["used"] > 30
+
+
+def test_what_is_used_has_finite_values():
+    """In a process of its own: a crash or an endless loop is an outcome like others."""
+    report = fuzz(60, seed=4)
+    assert not report.faults, str(report)
+    assert report.counts.total() == 60 and report.counts["used"] > 2
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ('Traceback\n  …\nParameterError: glint_grid: "alpha" must be … (got 3)', "refused"),
+        ("Traceback\n  …\nTypeError: unsupported operand", "no sentence"),
+        ('Traceback\n  …\nParameterError: glint_grid: "beta" must be …', "another parameter"),
+    ],
+)
+def test_faults_are_told_apart(message, expected):
+    case = Case("glint_grid", {"alpha": ("float", 3.0)})
+    result = judged(case, message)
+    assert result.startswith(expected) and (result in GOOD) == (expected == "refused")
