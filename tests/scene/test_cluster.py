@@ -95,6 +95,10 @@ def pids(cluster: Cluster) -> list[int]:
 
 def test_two_processes(job, two):
     assert np.array_equal(image(job, two), image(job, None))
+    # Threads are divided: Dask gives each worker one unit at a time, for all of its threads.
+    threads = two.client.run(os.getenv, clusters.THREADS)
+    assert set(threads.values()) == {str(max(1, clusters.core_count() // 2))}
+    assert set(two.client.nthreads().values()) == {1}
 
 
 @pytest.mark.parametrize("changes", [{"trim": True}, {"denoise": True}], ids=["trim", "denoise"])

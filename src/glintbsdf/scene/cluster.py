@@ -55,6 +55,9 @@ AHEAD = 2
 #: Scenes that a worker keeps loaded: frames of a sequence follow each other.
 SCENES = 2
 
+#: Environment variable of a worker: threads that it renders with, where they are not Dask's.
+THREADS = "GLINTBSDF_THREADS"
+
 #: How often a unit that needs too much memory is halved.
 HALVINGS = 2
 
@@ -147,7 +150,8 @@ def work(expected: dict[str, str], task: bytes) -> Answer:
         if missing:
             return Answer(worker.address, tuple(missing))
         try:
-            renderer = _renderer(job, store, threads=worker.state.nthreads)
+            threads = int(os.environ.get(THREADS) or worker.state.nthreads)
+            renderer = _renderer(job, store, threads)
             tile, sums = renderer.render(unit)
         except Exception as error:
             if "out of memory" in str(error).lower() and not isinstance(error, MemoryError):
@@ -261,9 +265,13 @@ class Cluster:
             import dask
             from distributed import Client, Nanny, Scheduler, SpecCluster
 
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
-            threads = max(1, (cores or os.cpu_count() or 1) // workers)
-            gpus = gpu_count() if variant.startswith("cuda") else 0
+            threads = max(1, core_count() // workers)
+            gpus = visible_gpus() if variant.startswith("cuda") else []
+
+            def environment(number: int) -> dict[str, str]:
+                own = {THREADS: str(threads)}
+                return {**own, "CUDA_VISIBLE_DEVICES": gpus[number % len(gpus)]} if gpus else own
+
             loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
             spec = {
                 number: {
@@ -271,11 +279,11 @@ class Cluster:
                     "options": {
                         "host": "127.0.0.1",
                         "dashboard_address": "127.0.0.1:0",
-                        "nthreads": threads,
+                        "nthreads": 1,  # units at a time
                         "memory_limit": memory_limit,
                         "preload": [__name__],
                         "silence_logs": "CRITICAL",
-                        "env": {"CUDA_VISIBLE_DEVICES": str(number % gpus)} if gpus else {},
+                        "env": environment(number),
                     },
                 }
                 for number in range(workers)
@@ -612,15 +620,24 @@ def _is_loopback(address: str) -> bool:
     return host in ("localhost", "::1") or host.startswith("127.")
 
 
-def gpu_count() -> int:
-    """NVIDIA GPUs of this machine, as their driver counts them."""
+def core_count() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def visible_gpus() -> list[str]:
+    """NVIDIA GPUs that this process may use, by the names of ``CUDA_VISIBLE_DEVICES``."""
     import ctypes
 
     try:
         driver = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
     except OSError:
-        return 0
+        return []
     count = ctypes.c_int(0)
     if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)):
-        return 0
-    return count.value
+        return []
+    named = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    names = [name.strip() for name in named if name.strip()]
+    return (names or [str(number) for number in range(count.value)])[: count.value]
