@@ -317,7 +317,8 @@ class GlintBSDF(FootprintBSDF):
         # of the surface, is an invalid sample: its mass is missing from the pdf as well.
         query = self.query(si, active)
         pndf, masking = self.facets(ctx, si)
-        m = pndf.sample_visible(wi, query, sample1, sample2, active)
+        # It is kept where it is: derivatives of an estimate are those of what it weighs.
+        m = dr.detach(pndf.sample_visible(wi, query, sample1, sample2, active))
         wo, active = component.scattered(wi, m, active)
         density = self.density(pndf, m, query, si, active)
         pdf = pndf.visible_pdf(wi, m, density, query, active)
@@ -330,7 +331,8 @@ class GlintBSDF(FootprintBSDF):
         bs.sampled_component = index
 
         value = component.value(density, wi.z)
-        weight = value / dr.select(active, component.density_of_direction(pdf, wo, m), 1)
+        drawn = dr.detach(component.density_of_direction(pdf, wo, m))
+        weight = value / dr.select(active, drawn, 1)
         return bs, self.scattered(
             weight, component, pndf, masking, ctx, si, wi, wo, m, query, active
         )

@@ -426,6 +426,100 @@ def check_derivative(bsdf: mi.BSDF, view: View, key: str, count: int = 50) -> No
     assert dr.allclose(forward, reverse, rtol=1e-3), (forward, reverse)
 
 
+def check_render_derivative(
+    bsdf: dict,
+    key: str,
+    integrator: str = "prb",
+    spp: int = 64,
+    seeds: int = 5,
+    modes: tuple[str, ...] = ("reverse",),
+    resolution: float = 0.5,
+) -> None:
+    """Derivatives of an image with respect to a parameter are those of the image.
+
+    The image, of a plate under a spherical lamp, is weighed by itself, so that contrast counts as
+    well as brightness. Automatic derivatives are compared with central differences of the same
+    seeds: they may differ by 2 %, or by three standard errors of their mean difference. A check so
+    noisy that it would let ``resolution`` times the derivative pass fails as well.
+
+    Args:
+        bsdf: the BSDF's description, without an adapter for its back.
+        key: the parameter, as ``mi.traverse`` names it in the BSDF. All of its values grow by the
+            same factor, between 0.98 and 1.02 of what they are.
+        modes: ``reverse`` and ``forward``.
+    """
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 2}
+            if integrator != "direct"
+            else {"type": "direct"},
+            "sensor": {
+                "type": "perspective",
+                "fov": 30,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 16,
+                    "height": 16,
+                    "rfilter": {"type": "box"},
+                },
+            },
+            "plate": {"type": "rectangle", "bsdf": bsdf},
+            "lamp": {
+                "type": "sphere",
+                "center": [0.6, 0.3, 4],
+                "radius": 0.5,
+                "emitter": {"type": "area", "radiance": 10.0},
+            },
+        }
+    )
+    params = mi.traverse(scene)
+    (name,) = (k for k in params.keys() if k.endswith("." + key))  # noqa: SIM118 (not a dict)
+    kind, start = type(params[name]), np.array(params[name])
+    step = 0.02
+
+    def grown(amount: float) -> object:
+        values = (start * (1 + amount)).astype(np.float32)
+        return kind(values) if values.ndim > 1 else kind(values.ravel())
+
+    weights = mi.render(scene, spp=4 * spp, seed=seeds)
+    weights = dr.detach(weights / dr.mean(weights, axis=None))
+
+    def measure(image: mi.TensorXf) -> mi.Float:
+        return dr.mean(image * weights, axis=None)
+
+    def value(amount: float, seed: int) -> float:
+        params[name] = grown(amount)
+        params.update()
+        return float(measure(mi.render(scene, spp=spp, seed=seed)).array[0])
+
+    def derivative(mode: str, seed: int) -> float:
+        params[name] = grown(0)
+        dr.enable_grad(params[name])
+        if mode == "forward":
+            dr.set_grad(params[name], grown(0))
+        params.update()
+        result = measure(mi.render(scene, params, spp=spp, seed=seed))
+        if mode == "forward":
+            return float(dr.forward_to(result).array[0])
+        dr.backward(result)
+        return float((np.array(dr.grad(params[name])).reshape(start.shape) * start).sum())
+
+    differences = np.array(
+        [(value(step, seed) - value(-step, seed)) / (2 * step) for seed in range(seeds)]
+    )
+    for mode in modes:
+        apart = np.array([derivative(mode, seed) for seed in range(seeds)]) - differences
+        noise = 3 * apart.std(ddof=1) / np.sqrt(seeds)
+        right = abs(differences.mean())
+        assert abs(apart.mean()) <= max(noise, 0.02 * right), (
+            f"{key}, {integrator}, {mode}: {differences.mean() + apart.mean():.4g}, "
+            f"central differences {differences.mean():.4g}, noise {noise:.2g}"
+        )
+        assert noise <= resolution * right, f"{key}, {integrator}: noise {noise:.2g} of {right:.2g}"
+
+
 # --------------------------------------------------------------------------------------------------
 #  Parameters
 # --------------------------------------------------------------------------------------------------

@@ -34,6 +34,13 @@ KERNELS = ("gaussian", "disk", "box")
 #: Reach of each kernel in standard deviations.
 REACH = {"gaussian": 3.0, "disk": 1.5, "box": 1.5}
 
+#: Variance of each kernel for a footprint of unit variance: they are cut off.
+VARIANCE = {
+    "gaussian": 1 - 4.5 * exp(-4.5) / (1 - exp(-4.5)),
+    "disk": 1.5**2 / 4,
+    "box": 1.5**2 / 3,
+}
+
 #: Width of the edge that derivatives see: in ρ², for the box as a share of its half extents. The
 #: derivative of the kernel's variance is off by the square of it, 1 % for the disk.
 EDGE = {"gaussian": 1.0, "disk": 0.5, "box": 0.1}

@@ -279,24 +279,8 @@ def test_predicted_error(variant, name, kernel):
     assert 0.45 < np.mean(ratios) < 1
 
 
-@pytest.mark.parametrize("name", ["isotropic", "leather"])
-def test_data_with_derivatives_are_evaluated_exactly(variant, name):
-    """The tables have no derivatives with respect to the map, so they stand back."""
-    normal_map = getattr(maps, name)(48, seed=1)
-    m = mi.Vector2f(np.random.default_rng(1).normal(scale=0.1, size=(2, 60)).astype(np.float32))
-    view = footprint(12, size=(48, 48))
-    gradients = []
-    for pndf in (
-        TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.1),
-        Manifold(normal_map, epsilon=EPSILON),
-    ):
-        dr.enable_grad(pndf.data)
-        pndf.parameters_changed(["data"])
-        dr.backward(dr.sum(pndf.eval(m, view)))
-        gradients.append(pndf.data.grad.numpy())
-    largest = np.abs(gradients[0]).max()
-    assert largest > 0 and np.allclose(*gradients, rtol=1e-3, atol=1e-5 * largest)  # order of sums
-
+def test_tables_stand_back_for_data_with_derivatives(variant):
+    normal_map = maps.isotropic(48, seed=1)
     tabulated = TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.1)
     dr.enable_grad(tabulated.data)
     tabulated.parameters_changed(["data"])

@@ -337,6 +337,7 @@ class Elements(Mixture):
         owner (str): whom errors name, usually the plugin.
         domain (Domain): what will be asked; None for anything. Where all footprints are summed cell
             by cell, no lists are made; within the domain D is the same to the last bit.
+        data (mi.TensorXf): the normals of ``normal_map`` where they carry derivatives.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it and through
@@ -354,12 +355,14 @@ class Elements(Mixture):
         curved: bool = True,
         owner: str = "Elements",
         domain: Domain | None = None,
+        data: mi.TensorXf | None = None,
     ) -> None:
         check_sigma_r(owner, sigma_r)
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
         self.wrap_mode = normal_map.wrap_mode
-        self.data = mi.TensorXf(normal_map.normals)
+        self.data = mi.TensorXf(normal_map.normals) if data is None else data
+        self.changed = data is not None
         self.sigma_r = mi.Float(sigma_r)
         self.build(domain)
 

@@ -487,7 +487,7 @@ class ClusteredManifold(Manifold):
 
     Attributes:
         ladder (Ladder): the cuts; None where no footprint would use a cluster.
-        data (mi.TensorXf): as in ``TexelMesh``, but no derivatives flow to it through clusters.
+        data (mi.TensorXf): as in ``TexelMesh``.
 
     Raises :class:`~.ParameterError`.
     """
@@ -509,6 +509,9 @@ class ClusteredManifold(Manifold):
     def build(self, domain: Domain | None = None) -> None:
         """Make lists and clusters; the cache may know most of it. Clusters are always complete."""
         super().build(domain)
+        self.ladder = None
+        if self.stand_in is not None:
+            return
         self.make_vertices()
         height, width, _ = self.data.shape
         self.clusters = ClusterLattice(height, width, self.normal_map.wrap_mode)
@@ -526,7 +529,7 @@ class ClusteredManifold(Manifold):
             return Ladder.build(self.clusters, self.data.numpy(), self.epsilon, limit, triangles_of)
 
         arrays = self.cached(build_ladder, self.epsilon, self.threshold)
-        self.ladder, self.vertices = None, quads_alone
+        self.vertices = quads_alone
         if len(arrays["thresholds"]):
             self.ladder = Ladder(self.clusters, arrays)
             self.vertices = dr.concat([quads_alone, mi.Float(arrays["normals"].ravel())])
@@ -604,9 +607,6 @@ class ClusteredManifold(Manifold):
         l2 = ((u.y - y) + (row & inside)) * side
         normals = self.element_normals(row, column, level, active)
         return normal_in_quad(l1, l2, normals, self.epsilon)
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("data", self.data, mi.ParamFlags.NonDifferentiable)
 
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, exact and clustered, bytes."""

@@ -8,6 +8,7 @@ footprint, which inverted lists find, and the sampler of Eq. 6.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -15,14 +16,21 @@ import numpy as np
 
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import VARIANCE
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.elements.elements import Elements
 from glintbsdf.pndf.index.lists import QuadLists, Window, every_quad
 from glintbsdf.pndf.manifold import projected_area
 from glintbsdf.pndf.manifold.mesh import TexelMesh, equilateral, quad_density
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
+
+#: Roughness σ_r of the elements that stand in for the manifold while derivatives of the map are
+#: asked for: as a share of the standard deviation of the map's normals, and at least.
+ROUGHNESS, MIN_ROUGHNESS = 0.1, 1e-3
 
 
 @register("manifold", title="manifold, exact", plugin="glint_manifold")
@@ -35,6 +43,12 @@ class Manifold(TexelMesh, PNDF):
         domain (Domain): what will be asked; None for anything. Lists are then made of the part of
             the map that it touches, or none where all footprints are summed quad by quad.
             Evaluation within the domain is the same to the last bit.
+
+    As a function of the map, D at a fixed m jumps wherever an edge of a triangle crosses m. It has
+    a derivative as a distribution only, ``∂D/∂θ = −div_m ∫ k δ(m − n(u)) ∂n/∂θ du``. So as long as
+    the ``data`` carry derivatives, an :class:`~.Elements` mixture of the same map stands in, of the
+    little roughness :data:`ROUGHNESS`, in evaluation as in sampling. It is smooth, and its elements
+    follow the same triangles: averages over more than this roughness have the same derivatives.
     """
 
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
@@ -54,7 +68,14 @@ class Manifold(TexelMesh, PNDF):
     def build(self, domain: Domain | None = None) -> None:
         """Make the lists of what queries within ``domain`` need; the cache may know them."""
         self.domain = domain
-        self.lists = None
+        self.lists, self.stand_in = None, None
+        if dr.grad_enabled(self.data):
+            spread = float(np.mean(np.var(self.normal_map.normals, axis=(0, 1)))) ** 0.5
+            roughness = max(ROUGHNESS * spread, MIN_ROUGHNESS)
+            self.stand_in = Elements(
+                self.normal_map, roughness, owner=self.owner, domain=domain, data=self.data
+            )
+            return
         if domain is not None and domain.most_quads <= tuning().few_quads:
             return
         window = Window.whole(self.lattice)
@@ -86,6 +107,39 @@ class Manifold(TexelMesh, PNDF):
         normals = self.data.numpy().reshape(-1, 2)
         reach = equilateral(self.epsilon)[0][1] * 1.001
         return normals.min(0) - reach, normals.max(0) + reach
+
+    def eval(
+        self, m: mi.Vector2f, query: Query | Footprint, active: bool | mi.Bool = True
+    ) -> mi.Float:
+        if self.stand_in is None:
+            if dr.grad_enabled(self.data):
+                raise RuntimeError(
+                    f'{self.owner}: derivatives with respect to "data" need a smooth P-NDF, which '
+                    "params.update() makes; it must be called after dr.enable_grad()"
+                )
+            return super().eval(m, query, active)
+        return self.stand_in.eval(m, self.asked_of_stand_in(query), active)
+
+    def sample(
+        self,
+        query: Query | Footprint,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: bool | mi.Bool = True,
+    ) -> mi.Vector2f:
+        if self.stand_in is None:
+            return super().sample(query, sample1, sample2, active)
+        return self.stand_in.sample(self.asked_of_stand_in(query), sample1, sample2, active)
+
+    def asked_of_stand_in(self, question: Query | Footprint) -> Query:
+        """The query of the Gaussian footprint that has the variance of this kernel's."""
+        query, width = Query.of(question), sqrt(VARIANCE[self.kernel])
+
+        def narrowed() -> Query:
+            seen = query.footprint
+            return query.at(Footprint(seen.uv, seen.du * width, seen.dv * width))
+
+        return query.once(("stand-in", self.kernel), narrowed)
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 5); 0 outside of it."""
@@ -128,4 +182,5 @@ class Manifold(TexelMesh, PNDF):
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
         lists = 0 if self.lists is None else self.lists.nbytes
-        return {**super().parts(), "lists of quads": lists}
+        stand_in = {} if self.stand_in is None else self.stand_in.parts()
+        return {**super().parts(), **stand_in, "lists of quads": lists}

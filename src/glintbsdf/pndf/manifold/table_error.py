@@ -15,19 +15,12 @@ mean over some places plus a standard deviation, so that most places err less.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import exp, sqrt
+from math import sqrt
 
 import drjit as dr
 import numpy as np
 
-from glintbsdf.footprint.kernels import KERNELS, REACH
-
-#: Variance of the kernels of unit standard deviation, which are cut off.
-VARIANCE = {
-    "gaussian": 1 - 4.5 * exp(-4.5) / (1 - exp(-4.5)),
-    "disk": 1.5**2 / 4,
-    "box": 1.5**2 / 3,
-}
+from glintbsdf.footprint.kernels import KERNELS, REACH, VARIANCE
 
 #: Largest share of a footprint's variance that the functions of the nodes may add.
 MAX_NARROWING = 0.6

@@ -31,14 +31,14 @@ from glintbsdf.core.opaque import opaque
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import KERNELS, TexelKernel
+from glintbsdf.footprint.kernels import KERNELS, VARIANCE, TexelKernel
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.pndf.base import register
 from glintbsdf.pndf.manifold.exact import Manifold
 from glintbsdf.pndf.manifold.mesh import normal_in_quad
-from glintbsdf.pndf.manifold.table_error import MAX_NARROWING, VARIANCE, predicted, widest
+from glintbsdf.pndf.manifold.table_error import MAX_NARROWING, predicted, widest
 from glintbsdf.pndf.manifold.tables import MIN_SPACING, TWO_THIRDS, NormalTables
 
 
@@ -61,9 +61,7 @@ class TabulatedManifold(Manifold):
             manifold tables``). Footprints so small that it would be larger are evaluated exactly.
         domain: as for :class:`Manifold`; there are no tables where all footprints are exact.
 
-    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly, and so is one whose data carry
-    derivatives: the tables have some with respect to the footprint, but none with respect to the
-    map, on which they depend through areas of triangles clipped to bins. From exact to tables, and
+    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. From exact to tables, and
     from level to level, densities change by less than ``max_error`` at a size of the footprint:
     there is no blending, which would cost both.
     """
@@ -91,8 +89,8 @@ class TabulatedManifold(Manifold):
         """Make lists and tables for queries within ``domain``; the cache may know them."""
         super().build(domain)
         self.tables = None
-        differentiated = dr.grad_enabled(self.data)
-        if self.normal_map.wrap_mode != "clamp" and self.may_use_tables() and not differentiated:
+        exact = self.stand_in is not None or self.normal_map.wrap_mode == "clamp"
+        if not exact and self.may_use_tables():
             self.tables = NormalTables(
                 self.cached(self.build_tables, self.epsilon),
                 (self.lattice.y.quads, self.lattice.x.quads),

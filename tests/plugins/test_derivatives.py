@@ -1,0 +1,75 @@
+"""Derivatives of images: every BSDF, every parameter flagged differentiable, all integrators."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import pytest
+
+from glintbsdf import maps
+from glintbsdf.check.suite import check_render_derivative
+
+# Parameters, and samples per pixel where more than usual are needed to see the derivative.
+WITH_MAP = {
+    "elements": {"type": "glint_elements", "sigma_r": 0.05},
+    "manifold": {"type": "glint_manifold", "footprint_sigma": 2.0},
+    "tables": {"type": "glint_manifold", "footprint_sigma": 3.0, "max_error": 0.05},
+    "lean": {"type": "glint_filtered", "method": "lean", "alpha": 0.1},
+    "diffuse": {"type": "glint_diffuse", "footprint_sigma": 2.0},
+    "mip": {"type": "glint_mip", "output_size": 128, "patch_size": 16, "sigma_r": 0.05},
+}
+WITHOUT_MAP = {
+    "flakes": {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08},
+    "grid": {"type": "glint_grid", "alpha": 0.2, "density": 6.0},
+}
+KEYS = [
+    ("elements", "sigma_r", 64),
+    ("elements", "footprint_sigma", 64),
+    ("elements", "pixel_spread", 64),
+    ("elements", "data", 64),
+    ("manifold", "footprint_sigma", 256),
+    ("manifold", "pixel_spread", 256),
+    ("manifold", "data", 512),
+    ("tables", "footprint_sigma", 256),
+    ("lean", "alpha", 64),
+    ("lean", "pixel_spread", 64),
+    ("lean", "data", 64),
+    ("diffuse", "data", 256),
+    ("mip", "sigma_r", 64),
+    ("flakes", "sigma_r", 64),
+    ("grid", "alpha_u", 64),
+]
+
+
+def bsdf(name: str, **settings) -> dict:
+    if name in WITHOUT_MAP:
+        description = WITHOUT_MAP[name]
+    else:
+        normals = maps.isotropic(32, alpha=0.2, correlation_length=3, seed=5).normals
+        description = {**WITH_MAP[name], "data": mi.TensorXf(normals)}
+    return {"pixel_spread": 0.02, **description, **settings}
+
+
+def two_sided(nested: dict) -> dict:
+    return {"type": "twosided", "nested": nested}
+
+
+@pytest.mark.parametrize("name, key, spp", KEYS)
+def test_derivative_of_an_image(variant, name, key, spp):
+    check_render_derivative(two_sided(bsdf(name)), key, "prb", spp)
+
+
+@pytest.mark.parametrize("integrator", ["prb_basic", "direct", "path", "glint_path"])
+def test_derivative_in_every_integrator(variant, integrator):
+    check_render_derivative(two_sided(bsdf("elements")), "sigma_r", integrator)
+
+
+@pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])
+def test_derivative_in_forward_mode(variant, integrator):
+    check_render_derivative(
+        two_sided(bsdf("elements")), "sigma_r", integrator, spp=256, seeds=3, modes=("forward",)
+    )
+
+
+@pytest.mark.parametrize("integrator", ["path", "glint_path"])
+def test_derivative_of_a_map_in_symbolic_integrators(variant, integrator):
+    check_render_derivative(two_sided(bsdf("elements")), "data", integrator)
