@@ -1,4 +1,4 @@
-"""What is measured on: maps, footprints and scenes."""
+"""Maps, footprints and scenes that the benchmarks measure on."""
 
 from __future__ import annotations
 

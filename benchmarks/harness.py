@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def timed(action: Callable) -> tuple:
-    """What an action returns, evaluated, and the seconds it took."""
+    """Return what an action returns, evaluated, and the seconds it took."""
     dr.sync_thread()
     start = time.perf_counter()
     result = action()
@@ -123,7 +123,7 @@ class Store:
 
 
 def machine(*modules: str) -> dict:
-    """What figures are measured on; ``modules`` are files that measure besides those of all."""
+    """Describe what figures are measured on; ``modules`` are further files that measure."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -150,7 +150,7 @@ def open_store(folder: Path, *modules: str) -> Store:
 
 
 def source_hash(*modules: str) -> str:
-    """A hash of the package's source, of what of the benchmarks measures, and of ``modules``."""
+    """Hash the source of the package, what of the benchmarks measures, and ``modules``."""
     measuring = ("src/**/*.py", "plugins/*.py", "benchmarks/*.py", "benchmarks/measures/*.py")
     paths = {path for pattern in measuring for path in ROOT.glob(pattern)}
     digest = hashlib.blake2b(digest_size=8)

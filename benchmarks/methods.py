@@ -1,4 +1,4 @@
-"""What is compared: every method at a ladder of settings. One list serves all commands.
+"""Every method that is compared, at a ladder of settings. One list serves all commands.
 
 A method of the register (:func:`glintbsdf.pndf.methods`) that has no ladder here takes part with
 the settings that it is registered with.
@@ -18,8 +18,8 @@ from glintbsdf.check.truth import mirrors
 from glintbsdf.pndf import methods
 from glintbsdf.pndf.manifold.mesh import equilateral
 
-#: Roughness σ_r on the disk that elements, lobes and filters add to the map, so that they answer
-#: one question. A filter's α is √2 times that.
+#: Elements, lobes and filters add this roughness σ_r on the disk to the map, so that they answer
+#: one question. The α of a filter is √2 times as large.
 SIGMA_R = 0.005
 ALPHA = SIGMA_R * 2**0.5
 
@@ -68,7 +68,7 @@ class Method:
         return {**self.plugin, **options, **normals}
 
     def build(self, surface: Surface):
-        """The P-NDF. Without masking, which is no part of it."""
+        """Make the P-NDF, without masking, which is no part of it."""
         parameters = {"masking": "none"}
         if self.plugin["type"] == "glint_manifold":
             parameters["epsilon"] = surface.epsilon
@@ -86,7 +86,7 @@ def ladder(
     cost: Iterable = (),
     **plugin: object,
 ) -> list[Method]:
-    """One method per value of a parameter; ``quick``, ``image``, ``cost``: values used there."""
+    """Make a method per value of a parameter; ``quick``, ``image``, ``cost`` name some of them."""
     label = parameter if label is None else label
     return [
         Method(
@@ -165,7 +165,7 @@ def rough(normal_map: NormalMap, to_uv: object = None, **parameters: object) -> 
     return {"type": "roughconductor", "alpha_u": alpha_u, "alpha_v": alpha_v, **parameters}
 
 
-#: What images are compared with besides: dictionaries of stock BSDFs, by name.
+#: Images are compared with stock BSDFs as well; each function makes the dictionary of one.
 BASELINES: dict[str, Callable[..., dict]] = {"brute force": brute_force, "roughconductor": rough}
 
 # --------------------------------------------------------------------------------------------------
@@ -246,9 +246,9 @@ STIFF: dict[str, Stiff] = {
     for entry in REGISTERED
 }  # fmt: skip
 
-#: Widths of lobes of normals that parameters stand for (of a degenerate triangle the radius of the
-#: circle in it), and the narrowest that can be judged: float32 half vectors are 6e-8 apart, and
-#: recovered from two directions with an error of about 1e-7.
+#: Parameters stand for widths of lobes of normals; that of a degenerate triangle is the radius of
+#: the circle in it. A lobe can be judged down to the narrowest: float32 half vectors are 6e-8
+#: apart, and two directions give them with an error of about 1e-7.
 WIDTHS: dict[str, Callable[[float], float]] = {
     "alpha": lambda alpha: alpha,
     "sigma_r": lambda sigma_r: sigma_r,

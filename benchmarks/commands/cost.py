@@ -18,10 +18,10 @@ from benchmarks.methods import METHODS, Method, rough
 from glintbsdf import NormalMap
 from glintbsdf.scene.rendering import pixel_angle
 
-#: Footprints on the curved patch, pixels.
+#: Footprints on the curved patch have these sizes, in pixels.
 PIXELS = (1 / 16, 1, 4)
 
-#: Views of the plane: degrees above it, and distances.
+#: The plane is seen from so many degrees above it, from these distances.
 ELEVATIONS, DISTANCES, FIELD_OF_VIEW = (90, 10), (1.0, 30.0), 30.0
 
 
@@ -85,7 +85,7 @@ def renders(run: Run) -> None:
                     table.measure({"method": method.name, **where}, work)
 
 
-#: Bytes that papers report: by the type of plugin, side of the sample and of the map, and setting.
+#: Papers report these bytes; keys are the plugin, sides of sample and map, and the setting.
 PAPERS = {
     ("glint_elements", 2048, 2048, "step 0.5"): 1120e6,
     ("glint_elements", 2048, 2048, "step 1.0"): 280e6,

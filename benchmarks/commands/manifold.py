@@ -18,7 +18,7 @@ from glintbsdf.pndf import TabulatedManifold
 
 NAMES = ("isotropic", "smooth", "brushed", "scratched", "flakes", "leather")
 
-#: Of r = 3σ (texels) of the smaller axis, with aspect and rotation.
+#: Their smaller axes have radii r = 3σ of 16 to 512 texels.
 ELLIPSES = (
     *(Ellipse.round(radius / 3) for radius in (16, 32, 64, 128, 256, 512)),
     Ellipse(128 / 3, 64 / 3, 30),

@@ -39,7 +39,7 @@ WIDTHS = (8, 16, 32, 64, 128, 256, 512)
 WIDEST_REFERENCE = 128
 RES = 128
 
-#: A sample, and the structures made of it: by setting.
+#: A function that makes structures of a sample, by setting.
 Structures = Callable[[], dict]
 
 

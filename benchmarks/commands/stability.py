@@ -45,8 +45,7 @@ from glintbsdf.cli.entry import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.scene.rendering import replacing
 
-#: Maps on which parameters are swept, and on which pictures are made; the latter is what is left
-#: of all maps in a hurry.
+#: Parameters are swept on the first maps, pictures made on the second; in a hurry only these count.
 SWEPT, STIFFEST = ("step edge", *NO_MAP), ("white noise", *NO_MAP)
 
 
@@ -179,8 +178,8 @@ def promised(method: Stiff, views: list[View]) -> list[View]:
     return views
 
 
-#: The most that Oren and Nayar's model reflects of uniform light, along the horizon: A + B/2, of
-#: all roughnesses.
+#: Oren and Nayar's model reflects at most this share of uniform light, along the horizon: the
+#: maximum of A + B/2 over roughness.
 OREN_NAYAR = 1.0152
 
 

@@ -1,1 +1,1 @@
-"""What is measured: plain functions that return numbers, and do not judge."""
+"""Measures are plain functions that return numbers. They do not judge."""

@@ -1,4 +1,4 @@
-"""``glint_grid``, which has no map: against its own mean, and against itself without approximation.
+"""``glint_grid`` has no map. It is compared with its own mean, and with itself, approximated less.
 
 Its details are random by definition, so that no picture of theirs is more right than another. What
 its ladder of ``max_anisotropy`` trades is contrast: a footprint more stretched than that is
@@ -21,15 +21,15 @@ from benchmarks.measures.pndf import batch
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.pndf.grid.microdetails import Grid, beckmann, slope_jacobian
 
-#: Of the footprint: its axes are as 1 to this.
+#: The footprint is this many times as long as it is wide.
 STRETCH = 64.0
 
 LADDER = (1.0, 4.0, 16.0, 64.0)
 
-#: Details per unit UV area (log10), and the minor standard deviation of the footprint, UV.
+#: The density is log10 of details per unit UV area; σ is the footprint's across, in UV.
 DENSITY, SIGMA = 5.0, 2e-3
 
-#: Side of the square that places are drawn from, UV: few of their footprints meet.
+#: Places are drawn from a square of this side, in UV, so that few of their footprints meet.
 EXTENT = 1e3
 
 ALPHA = 0.3
@@ -37,14 +37,14 @@ ALPHA = 0.3
 
 @dataclass(frozen=True)
 class Settings:
-    """``places``: independent ones, over which mean and contrast are taken."""
+    """Mean and contrast are taken over ``places`` independent places."""
 
     places: int
     repetitions: int
 
 
 def measure(settings: Settings):
-    """A unit of the store: mean, contrast and time of every rung."""
+    """Return mean, contrast and time of every rung, as a unit of the store."""
     u, v, turn = np.random.default_rng(1).random((3, settings.places))
     axis = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)])
     across = np.stack([-axis[1], axis[0]])
@@ -84,10 +84,11 @@ def measure(settings: Settings):
 
 
 def contrast(values: np.ndarray) -> float:
+    """Return the standard deviation over the mean."""
     return float(values.std() / values.mean())
 
 
 def contrast_error(values: np.ndarray, parts: int = 32) -> float:
-    """Standard error of the contrast, from that of parts of the places."""
+    """Return the standard error of the contrast, from the spread over parts of the places."""
     found = [contrast(part) for part in np.array_split(values, parts)]
     return float(np.std(found, ddof=1) / parts**0.5)

@@ -19,17 +19,17 @@ from benchmarks.methods import BASELINES, Method
 from glintbsdf.check.truth import Truth, reference_render
 from glintbsdf.scene.rendering import pixel_angle
 
-#: Radius of the lights: brute force finds the scene's own too seldom.
+#: The lights get this radius, as brute force finds the scene's own too seldom.
 LIGHT_RADIUS = 0.07
 
-#: Degrees: the patch fills the picture, and no light is seen but in it.
+#: Within so many degrees the patch fills the picture, and lights are seen in it alone.
 FIELD_OF_VIEW = 30.0
 
-#: Standard deviation of a box of one pixel: footprints have the variance of the truth's pixels.
+#: A box of one pixel has this standard deviation, so footprints vary as the truth's pixels do.
 FOOTPRINT_SIGMA = 12**-0.5
 
 
-#: Seconds for a process to end by itself.
+#: A process has so many seconds to end by itself.
 PATIENCE = 20
 
 
@@ -107,7 +107,7 @@ def serve(connection, variant: str, *arguments: object) -> None:
 
 
 def load(material: Method | str, surface: Surface, scale: float, settings: Settings) -> mi.Scene:
-    """The scene with a material: a method, or the name of a baseline."""
+    """Load the scene with a material, which is a method or the name of a baseline."""
     shared = {"material": "Cr", "to_uv": scaled(scale)}
     if isinstance(material, str):
         described = BASELINES[material](surface.normal_map, **shared)
@@ -133,7 +133,7 @@ def renderers(
 
 
 def truth(surface: Surface, scale: float, settings: Settings):
-    """A unit of the store: the truth, and its noise."""
+    """Return the truth and its noise, as a unit of the store."""
     scene = load("brute force", surface, scale, settings)
     found = reference_render(scene, spp=settings.truth_spp, seed=1000)
     values = {"samples_per_pixel": settings.truth_spp, "noise": found.relative_error}
@@ -153,7 +153,7 @@ def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
 
 
 def measure(made: dict[str, Renderer], reference: Truth, spp: int, settings: Settings):
-    """A unit of the store: all materials at one number of samples, in turn for every seed."""
+    """Render all materials in turn for every seed, with ``spp`` samples: a unit of the store."""
     taken, error, mean = ({name: [] for name in made} for _ in range(3))
     images = {}
     for renderer in made.values():
@@ -198,7 +198,7 @@ def in_turn(scenes: tuple[mi.Scene, mi.Scene], spp: int, repetitions: int) -> di
 
 
 def band(errors: list[float]) -> dict[str, float]:
-    """Mean over the seeds, and the 95 % interval of this mean by Student's t."""
+    """Return the mean over the seeds, and its 95 % interval by Student's t."""
     mean, n = float(np.mean(errors)), len(errors)
     half = float(scipy.stats.t.ppf(0.975, n - 1) * np.std(errors, ddof=1) / n**0.5)
     return {"rmse": mean, "rmse_low": max(mean - half, 0.0), "rmse_high": mean + half}

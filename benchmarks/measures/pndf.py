@@ -20,20 +20,20 @@ from glintbsdf import Footprint
 from glintbsdf.check import suite
 from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds
 
-#: Clamp of the Jacobian of those who have none: their own roughness hides it.
+#: A method with a roughness of its own has no clamp of the Jacobian; its reference has this one.
 UNCLAMPED = 1e-6
 
-#: Queries of a call that takes little more than to be traced, and most queries of a batch.
+#: A call with the few queries takes little more than its tracing; a batch has the most at most.
 FEW, MOST = 64, 2**18
 
-#: Seconds that a query takes at least: where queries take no longer than tracing does, noise may
-#: leave nothing of them.
+#: A query counts for at least so many seconds, as noise may leave nothing of its time where a
+#: call takes no longer than its tracing.
 LEAST = 1e-9
 
-#: Independent sets of points, whose spread tells the noise of a bin's mean.
+#: A bin's mean is taken from so many independent sets of points, whose spread tells its noise.
 SETS = 4
 
-#: Most points of a set per bin and axis, if time allows.
+#: A set has at most so many points per bin and axis.
 MOST_POINTS = 24
 
 
@@ -92,7 +92,7 @@ def forget_kernels() -> None:
 
 
 def measure(structures: dict[Method, object], surface: Surface, radius: float, settings: Settings):
-    """A unit of the report: errors and times of all methods under footprints of one size."""
+    """Return errors and times of all methods under footprints of one size: a unit of the store."""
     ellipse = Ellipse.round(radius / 3)
     many = queries(surface.normal_map, ellipse, MOST, surface.epsilon)
     taken, ratios = times(structures.values(), many, settings.repetitions, settings.batch)
@@ -155,7 +155,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
 
 
 def roughness(pndf) -> float:
-    """σ_r that a P-NDF has besides the map's normals."""
+    """Return the roughness σ_r that a P-NDF adds to the map's normals."""
     alpha = getattr(pndf, "alpha", None)
     if alpha is not None:  # a filter's: α² = 2σ²
         return round(float(alpha[0]) / 2**0.5, 9)
@@ -209,7 +209,7 @@ def bias(count: int) -> float:
 def p_value(
     reference: BinnedPNDF, density: np.ndarray, deviation: np.ndarray, samples: int, sets: int
 ) -> float:
-    """Of Pearson's χ² test of the reference's ``samples`` against a density from ``sets`` sets."""
+    """Test the ``samples`` of the reference against a density from ``sets`` sets, by χ²."""
     area = reference.bin_area
     # A variance estimated from n sets makes the square of a t-distribution, of this mean.
     deviation = deviation * bias(sets) * ((sets - 1) / (sets - 3)) ** 0.5
@@ -276,7 +276,7 @@ def times(
 
 
 def first(count: int, m: mi.Vector2f, footprint: Footprint) -> tuple:
-    """The first of many queries."""
+    """Return the first of many queries."""
     index = dr.arange(mi.UInt32, count)
     part = type(footprint)(dr.gather(mi.Point2f, footprint.uv, index), footprint.du, footprint.dv)
     m = dr.gather(mi.Vector2f, m, index)
@@ -285,7 +285,7 @@ def first(count: int, m: mi.Vector2f, footprint: Footprint) -> tuple:
 
 
 def batch_size(pndf, many: tuple, wanted: float) -> int:
-    """How many of many queries take about ``wanted`` seconds besides tracing, from 2 ``FEW`` on."""
+    """Return how many queries take about ``wanted`` seconds besides tracing, from 2 ``FEW`` on."""
     most = dr.width(many[0])
     traced = min(seconds(pndf.eval, *first(FEW, *many)) for _ in range(3))  # the first one compiles
     count = FEW
@@ -299,5 +299,5 @@ def batch_size(pndf, many: tuple, wanted: float) -> int:
 
 
 def batch(pndf, m: mi.Vector2f, footprint: Footprint, repetition: int) -> mi.Float:
-    """The same queries in every repetition."""
+    """Evaluate the same queries, whatever the repetition."""
     return pndf.eval(m, footprint)

@@ -13,7 +13,7 @@ from benchmarks.measures import images
 from benchmarks.report import figures, page, pareto
 from glintbsdf.scene.rendering import replacing
 
-#: Of the JSON; ``schema.json`` describes it.
+#: The JSON has this version; ``schema.json`` describes it.
 SCHEMA_VERSION = 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 #: Errors (relative L1) that one may ask for.
 TOLERANCES = (0.2, 0.1, 0.05, 0.02)
 
-#: An error up to this many times its noise is told from none by no measurement.
+#: No measurement tells an error up to this many times its noise from none.
 TELLABLE = 1.5
 
 #: Times within this factor of the fastest are as good: small footprints take all variants of a
