@@ -8,8 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
+import glintbsdf  # noqa: F401  (first in a renderer's process: it names Dr.Jit's LLVM library)
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
 import numpy as np
 import scipy.stats
 
