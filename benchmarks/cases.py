@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -233,6 +234,7 @@ def curved_patch(
     Lights of another radius keep their power.
     """
     dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba reads no image with a single one
+    gc.collect()  # no BSDF of a former scene may go while Dr.Jit records all that are alive
     text = (SCENES / "curved_patch.xml").read_text()
     start = text.index('<bsdf type="glint_manifold">')
     end = text.index("</bsdf>", start) + len("</bsdf>")
@@ -280,6 +282,7 @@ def picture_of(
     shape: dict, origin: list, up: list, fov: float, size: int, lights: dict, **options
 ) -> mi.Scene:
     """A square picture of one shape around the origin; ``options``: spp, max_depth, rfilter."""
+    gc.collect()  # as above
     film = {"type": "hdrfilm", "width": size, "height": size}
     film["rfilter"] = {"type": options.get("rfilter", "box")}
     sampler = {"type": "independent", "sample_count": options.get("spp", 16)}
