@@ -17,6 +17,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -67,28 +68,46 @@ def load_or_build(
     return arrays
 
 
+#: Locks that this process holds, and what guards the set.
+_held: set[Path] = set()
+_guard = threading.Lock()
+
+
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """In the block, no other process of this machine builds ``path``.
 
-    A process that dies gives its place to the next. Where the folder cannot be written, everybody
+    Mitsuba makes plugins in parallel, and a thread that waits for a kernel may take up the next
+    plugin meanwhile. So who holds a lock never waits for another one: it builds all the same. A
+    process that dies gives its place to the next. Where the folder cannot be written, everybody
     builds.
     """
     import filelock
 
-    lock = filelock.FileLock(path.with_suffix(".lock"))
+    lock = filelock.FileLock(path.with_suffix(".lock"), thread_local=False)
+    with _guard:
+        waits = not _held
+        mine = path not in _held
+        if mine:
+            _held.add(path)
+    locked = False
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    except (OSError, NotImplementedError):
-        yield
-        return
-    try:
+        if mine:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                lock.acquire(timeout=-1 if waits else 0)
+                locked = True
+            except (OSError, NotImplementedError, RuntimeError):
+                pass
         yield
     finally:
-        with contextlib.suppress(OSError):
-            Path(lock.lock_file).unlink(missing_ok=True)  # who waits for it may still have it
-        lock.release()
+        if locked:
+            with contextlib.suppress(OSError):
+                Path(lock.lock_file).unlink(missing_ok=True)  # who waits for it may still have it
+            lock.release()
+        if mine:
+            with _guard:
+                _held.discard(path)
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 
@@ -9,7 +10,10 @@ def warn(message: str) -> None:
     """Tell the user something through Mitsuba's log, the one channel for all warnings."""
     import mitsuba as mi
 
-    mi.Log(mi.LogLevel.Warn, message)
+    if mi.variant() is None:  # Mitsuba's log speaks in a variant only
+        print(message, file=sys.stderr)
+    else:
+        mi.Log(mi.LogLevel.Warn, message)
 
 
 class ParameterError(ValueError):
