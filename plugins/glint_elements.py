@@ -33,7 +33,9 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
 
  * - flake_alpha
    - |float|
-   - Beckmann roughness from which each flake draws its normal. (Default: 0.2)
+   - Beckmann roughness from which each flake draws its normal. Its derivatives are those of flakes
+     that turn where they are, all slopes in proportion to it. (Default: 0.2)
+   - |exposed|, |differentiable|
 
  * - seed
    - |int|

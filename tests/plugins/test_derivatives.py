@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 
 from glintbsdf import maps
-from glintbsdf.check.suite import check_render_derivative
+from glintbsdf.check.suite import View, check_render_derivative
 
 # Parameters, and samples per pixel where more than usual are needed to see the derivative.
 WITH_MAP = {
@@ -36,6 +37,7 @@ KEYS = [
     ("diffuse", "data", 256),
     ("mip", "sigma_r", 64),
     ("flakes", "sigma_r", 64),
+    ("flakes", "flake_alpha", 64),
     ("grid", "alpha_u", 64),
 ]
 
@@ -73,3 +75,47 @@ def test_derivative_in_forward_mode(variant, integrator):
 @pytest.mark.parametrize("integrator", ["path", "glint_path"])
 def test_derivative_of_a_map_in_symbolic_integrators(variant, integrator):
     check_render_derivative(two_sided(bsdf("elements")), "data", integrator)
+
+
+def test_what_has_no_derivative_says_so(variant):
+    """Instead of a derivative of zero."""
+    grid = mi.load_dict(bsdf("grid"))
+    params = mi.traverse(grid)
+    dr.enable_grad(params["density"])
+    with pytest.raises(ValueError, match='glint_grid: "density" has no derivative'):
+        grid.eval(mi.BSDFContext(), View().interaction(), mi.Vector3f(0, 0, 1))
+    dr.disable_grad(params["density"])
+    grid.eval(mi.BSDFContext(), View().interaction(), mi.Vector3f(0, 0, 1))
+
+
+def test_flakes_keep_their_places_as_they_turn(variant):
+    flakes = mi.load_dict(bsdf("flakes", flake_alpha=0.1))
+    params = mi.traverse(flakes)
+    before = flakes.pndf.flakes.numpy().reshape(-1, 4)
+    params["flake_alpha"] = mi.Float(0.2)
+    params.update()
+    after = flakes.pndf.flakes.numpy().reshape(-1, 4)
+    assert (after[:, :2] == before[:, :2]).all()
+    fresh = mi.load_dict(bsdf("flakes", flake_alpha=0.2)).pndf.flakes.numpy().reshape(-1, 4)
+    assert abs(after - fresh).max() < 1e-7
+    assert dr.allclose(flakes.pndf.alpha_squared(), 0.04)
+    params["flake_alpha"] = mi.Float(-0.1)
+    with pytest.raises(ValueError, match='"flake_alpha" must be a finite number ≥ 0'):
+        params.update()
+
+
+@pytest.mark.parametrize("adapter", ["normalmap", "blendbsdf"])
+def test_derivative_inside_of_adapters(variant, adapter):
+    nested = bsdf("elements")
+    if adapter == "normalmap":
+        flat = mi.TensorXf([0.5, 0.5, 1.0], (1, 1, 3))
+        texture = {"type": "bitmap", "data": flat, "raw": True, "filter_type": "nearest"}
+        outer = {"type": "normalmap", "normalmap": texture, "nested": nested}
+    else:
+        outer = {
+            "type": "blendbsdf",
+            "weight": 0.3,
+            "first": nested,
+            "second": {"type": "diffuse"},
+        }
+    check_render_derivative(two_sided(outer), "sigma_r", "prb")

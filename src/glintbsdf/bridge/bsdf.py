@@ -13,7 +13,7 @@ from glintbsdf.bridge.parameters import Number, Parameters, check_to_uv, declare
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
-from glintbsdf.core.errors import check
+from glintbsdf.core.errors import ParameterError, check
 from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
 from glintbsdf.footprint.query import Query
@@ -24,6 +24,22 @@ from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.base import PNDF
 from glintbsdf.pndf.displaced import Displaced, DisplacedMasking
 from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
+
+
+class RefusesDerivatives:
+    """A callback of ``traverse`` that raises :class:`~.ParameterError` where derivatives are asked
+    for that there are none of: they would be zero without a word."""
+
+    def __init__(self, owner: str) -> None:
+        self.owner = owner
+
+    def put(self, name: str, value: object, flags: int) -> None:
+        """Called for every parameter, as ``mi.TraversalCallback.put`` is."""
+        if int(flags) & int(mi.ParamFlags.NonDifferentiable) and dr.is_array_v(value):
+            if dr.grad_enabled(value):
+                raise ParameterError(
+                    f'{self.owner}: "{name}" has no derivative (asked for by dr.enable_grad)'
+                )
 
 
 class FootprintBSDF(mi.BSDF):
@@ -151,6 +167,7 @@ class FootprintBSDF(mi.BSDF):
 
     def query(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Query:
         """All that an evaluation at ``si`` asks of the P-NDF; made once for each."""
+        self.traverse(RefusesDerivatives(self.owner))
         return Query(self.footprint(si, active))
 
     def warn_of_point_footprint(self) -> None:

@@ -77,9 +77,15 @@ class Flakes(Mixture):
         seed (int): of the pattern and the normals.
         owner (str): whom errors name, usually the plugin.
 
+    Attributes:
+        flake_alpha (mi.Float): α. Its derivatives are those of flakes whose slopes grow with it:
+            each stays where it is, and turns.
+
     Raises :class:`~.ParameterError`; for more flakes than memory holds before any
     is allocated.
     """
+
+    roughness_keys = ("flake_alpha", "sigma_r")
 
     wrap_mode = "repeat"
     origin = (-0.5, -0.5)  # cells begin at the border of the square
@@ -95,36 +101,54 @@ class Flakes(Mixture):
     ) -> None:
         check_sigma_r(owner, sigma_r)
         check(1 <= density < inf, owner, "flake_density", "a finite number ≥ 1", density)
-        check(0 <= alpha < inf, owner, "flake_alpha", "a finite number ≥ 0", alpha)
+        check_alpha(owner, alpha)
         check_whole(seed, lambda value: value >= 0, owner, "seed", "≥ 0")
-        self.count, self.alpha, self.seed, self.owner = round(density), alpha, seed, owner
+        self.count, self.seed, self.owner = round(density), seed, owner
         check_memory(owner, self.count)
-        self.sigma_r = mi.Float(sigma_r)
+        self.sigma_r, self.flake_alpha = mi.Float(sigma_r), mi.Float(alpha)
 
-        flakes = self.cached(self.scatter, self.count, self.alpha, self.seed)
+        flakes = self.cached(self.scatter, self.count, self.seed)
         n = cells_for(self.count)
         self.map_cells = n, n
         self.variance = (SIGMA_H * n / sqrt(self.count)) ** 2
         self.lattice = Lattice(n, n, "repeat")
-        self.flakes = mi.Float(flakes["flakes"].ravel())  # x, y, normal x, normal y
+        self.places, self.deviates = flakes["places"], flakes["deviates"]
         self.areas = mi.Float(flakes["areas"].ravel())
+        self.exist = flakes["areas"].ravel() > 0
         self.densest = float(flakes["densest"])
+        self.turn(alpha)
         self.element_bytes = 4 * (dr.width(self.flakes) + dr.width(self.areas))
-        self.flake_normals = flakes["flakes"].reshape(-1, 4)[flakes["areas"].ravel() > 0, 2:]
         self.build()
 
     def scatter(self) -> dict[str, np.ndarray]:
-        """Places, areas and normals of the flakes, n×n, by cells; and the largest mass seen."""
+        """Places, areas and normal deviates of the flakes, n×n, by cells, and the largest mass
+        seen; slopes are the deviates times α/√2."""
         rng = np.random.default_rng(self.seed)
         places = poisson_disk(self.count, rng)
         areas = balanced_areas(places)
-        slopes = rng.normal(scale=self.alpha / sqrt(2), size=places.shape)
+        return {
+            "places": np.nan_to_num(places).astype(np.float32).reshape(-1, 2),
+            "deviates": rng.standard_normal(places.shape).reshape(-1, 2),
+            "areas": areas,
+            "densest": np.array(densest(places, areas)),
+        }
+
+    def turn(self, alpha: float) -> None:
+        """Give the flakes the normals of a roughness; derivatives flow from ``flake_alpha``."""
+        slopes = (alpha / sqrt(2)) * self.deviates
         normals = slopes / np.sqrt(1 + np.square(slopes).sum(axis=-1, keepdims=True))
-        flakes = np.concatenate([np.nan_to_num(places), normals], axis=-1).astype(np.float32)
-        return {"flakes": flakes, "areas": areas, "densest": np.array(densest(places, areas))}
+        self.flake_normals = normals[self.exist].astype(np.float32)
+        normals = mi.Vector2f(normals.T.astype(np.float32))
+        if dr.grad_enabled(self.flake_alpha):
+            deviates = mi.Vector2f(self.deviates.T.astype(np.float32))
+            slopes = self.flake_alpha * (1 / sqrt(2)) * deviates
+            normals = slopes * dr.rsqrt(1 + dr.squared_norm(slopes))
+        place = mi.Vector2f(self.places.T)
+        self.flakes = dr.ravel(mi.Vector4f(place.x, place.y, normals.x, normals.y))
+        dr.eval(self.flakes)
 
     def alpha_squared(self) -> mi.Vector2f:
-        return mi.Vector2f(self.alpha**2)
+        return mi.Vector2f(dr.square(self.flake_alpha))
 
     def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         # In the margin the cells at its border are found.
@@ -136,7 +160,7 @@ class Flakes(Mixture):
         reach = NORMAL_REACH * self.sigma_r[0]
 
         def ellipses(row, column, active):
-            normal = self.flake(row, column, active)[1]
+            normal = dr.detach(self.flake(row, column, active)[1])
             return ((normal, mi.Vector2f(reach, 0), mi.Vector2f(0, reach)),)
 
         def occupied(row, column, active):
@@ -147,7 +171,7 @@ class Flakes(Mixture):
         def build_lists(allowed: float = BYTES_OF_LISTS) -> dict[str, np.ndarray]:
             return Builder(blocks, self.flake_normals, self.normal_bounds(), allowed).arrays()
 
-        key = self.count, self.alpha, self.seed, self.sigma_r[0]
+        key = self.count, self.flake_alpha[0], self.seed, self.sigma_r[0]
         self.lists = QuadLists(self.lattice, self.cached(build_lists, *key))
         # With a single cell of normals: all flakes, block by block.
         self.all = QuadLists(self.lattice, build_lists(0))
@@ -212,22 +236,31 @@ class Flakes(Mixture):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
+        callback.put("flake_alpha", self.flake_alpha, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check a new roughness, and rebuild."""
-        if not keys or "sigma_r" in keys:
-            check_sigma_r(self.owner, self.sigma_r[0])
-            self.changed = True
-            self.build()
+        """Check new roughnesses, and rebuild."""
+        if keys and not {"sigma_r", "flake_alpha"} & set(keys):
+            return
+        check_sigma_r(self.owner, self.sigma_r[0])
+        check_alpha(self.owner, self.flake_alpha[0])
+        self.changed = True
+        self.turn(self.flake_alpha[0])
+        self.build()
 
     def parts(self) -> dict[str, int]:
         return {**super().parts(), "lists of flakes by place": self.all.nbytes}
 
     def __repr__(self) -> str:
         return (
-            f"Flakes[{self.count} flakes, alpha={self.alpha:g}, sigma_r={self.sigma_r[0]:g}, "
-            f"seed={self.seed}, {self.nbytes / 2**20:.1f} MiB]"
+            f"Flakes[{self.count} flakes, alpha={self.flake_alpha[0]:g}, "
+            f"sigma_r={self.sigma_r[0]:g}, seed={self.seed}, {self.nbytes / 2**20:.1f} MiB]"
         )
+
+
+def check_alpha(owner: str, alpha: float) -> None:
+    """Raise :class:`~.ParameterError` for a roughness of flakes that is not allowed."""
+    check(0 <= alpha < inf, owner, "flake_alpha", "a finite number ≥ 0", alpha)
 
 
 def densest(places: np.ndarray, areas: np.ndarray) -> float:
