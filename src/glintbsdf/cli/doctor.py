@@ -15,10 +15,19 @@ import mitsuba as mi
 from glintbsdf import __version__
 from glintbsdf.bridge import llvm
 
-_PACKAGES = ("numpy", "scipy", "OpenEXR", "scikit-image", "click", "rich", "platformdirs")
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "OpenEXR",
+    "scikit-image",
+    "click",
+    "rich",
+    "platformdirs",
+    "filelock",
+)
 
 #: Packages that only some need, and what for.
-_OPTIONAL = {"mitsuba-oidn": "render --denoise"}
+_OPTIONAL = {"mitsuba-oidn": "render --denoise", "distributed": "--workers and --scheduler"}
 
 # One kernel per variant, in a process of its own: a backend that does not work may abort it.
 _PROBE = """
