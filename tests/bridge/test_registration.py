@@ -68,3 +68,12 @@ def test_scalar_variant_is_refused_with_the_lines_to_type(plugin):
         mi.load_string(f'<scene version="3.0.0"><{kind} type="{plugin_type}"/></scene>')
     assert f"{plugin_type}: needs a JIT variant of Mitsuba" in str(error.value)
     assert 'mi.set_variant("llvm_ad_rgb")' in str(error.value)
+
+
+def test_base_classes_by_their_public_name_are_those_of_the_active_variant(variant):
+    from glintbsdf import bsdf
+
+    made = mi.load_dict({"type": "glint_grid"})
+    assert isinstance(made, bsdf.GlintBSDF) and isinstance(made, bsdf.FootprintBSDF)
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = bsdf.nothing
