@@ -36,10 +36,12 @@ def a_map(size: int = 64) -> np.ndarray:
     ).normals
 
 
-def plate(plugin: str, options: dict, size: int = 64) -> mi.Scene:
+def plate(plugin: str, options: dict, size: int = 64, wrapped: bool = False) -> mi.Scene:
     camera = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 8, "height": 8}
     bsdf = {"type": plugin, "data": mi.TensorXf(a_map(size)), "pixel_spread": 0.01, **options}
+    if wrapped:
+        bsdf = {"type": "twosided", "bsdf": bsdf}
     return mi.load_dict(
         {
             "type": "scene",
@@ -112,7 +114,7 @@ def test_bsdfs_go_with_their_scenes(variant, plugin, options):
     gc.disable()
     try:
         for _ in range(3):
-            np.array(mi.render(plate(plugin, options), spp=1))
+            np.array(mi.render(plate(plugin, options, wrapped=True), spp=1))
         assert not any(isinstance(thing, FootprintBSDF) for thing in gc.get_objects())
     finally:
         gc.enable()

@@ -63,6 +63,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(capsys, monkeypatch, variant):
     """Run the command line; return its exit status, its output and its errors."""
 
+    # A busy machine would have lines of progress among the errors.
+    monkeypatch.setattr("glintbsdf.core.progress._FIRST_LINE", 1e6)
+
     def run(*arguments: str | Path) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["glintbsdf", *map(str, arguments)])
         if arguments and arguments[0] in ("render", "pndf") and "-m" not in arguments:
@@ -201,6 +204,66 @@ def test_a_failed_rendering_keeps_the_former_image(run, folder, monkeypatch):
     assert run("render", "scene.xml")[0] == 1
     assert (folder / "scene.exr").read_text() == "former"
     assert set(folder.iterdir()) == before
+
+
+def test_one_of_several_sensors(run, folder):
+    far = SCENE.split("<sensor")[1].split("</sensor>")[0].replace("0,0,4", "0,0,40")
+    (folder / "two.xml").write_text(
+        SCENE.replace("<sensor", '<sensor id="near"').replace(
+            "<emitter", f'<sensor id="far"{far}</sensor><emitter', 1
+        )
+    )
+    images = {}
+    for which in (None, "0", "1", "near", "far"):
+        arguments = ["render", "two.xml", "--spp", 1, *([] if which is None else ["-s", which])]
+        status, _, errors = run(*arguments)
+        assert status == 0
+        assert (errors == "") == (which is not None)
+        images[which] = np.array(mi.Bitmap("two.exr"))
+        if which is None:
+            assert 'of the sensors 0 "near", 1 "far" the first is rendered, -s names' in errors
+    assert np.array_equal(images[None], images["0"]) and np.array_equal(images["1"], images["far"])
+    assert np.array_equal(images["0"], images["near"])
+    assert not np.array_equal(images["0"], images["1"])
+    status, _, errors = run("render", "two.xml", "-s", "side")
+    assert status == 1 and 'no sensor "side" among 0 "near", 1 "far"' in errors
+    status, report, _ = run("inspect", "two.xml", "-s", "far")
+    assert status == 0 and report != run("inspect", "two.xml", "-s", "near")[1]
+
+
+def test_files_of_the_scene_are_not_written_over(run, folder):
+    content = (folder / "map.exr").read_bytes()
+    (folder / "map.xml").write_text(SCENE)  # whose image would be map.exr
+    for arguments in (["scene.xml", "-o", "map.exr"], ["map.xml"]):
+        status, _, errors = run("render", *arguments)
+        assert status == 1 and "map.exr is a file of the scene: name another with -o" in errors
+    (folder / "map.png").write_bytes(content)
+    arguments = ["--type", "glint_filtered", "--map", "map.png", "--uv", 0.5, 0.5, "--sigma", 2]
+    status, _, errors = run("pndf", *arguments, "-o", "map.png")
+    assert status == 2 and "must not be the map itself" in errors
+    status, _, errors = run("synthesise", "map.exr", "-o", "map.exr")
+    assert status == 2 and "must not be the map itself" in errors
+    assert (folder / "map.exr").read_bytes() == content
+
+
+def test_what_is_said_of_footprints_fits_the_scene(folder, variant, capfd):
+    """With an orthographic camera, and on a curve, no footprint follows from pixel_spread."""
+    parallel = SCENE.replace("perspective", "orthographic").replace(
+        '<float name="fov" value="30"/>', ""
+    )
+    scene = mi.load_string(parallel)
+    rendering.render(scene, spp=1)
+    text = "".join(capfd.readouterr())
+    assert 'Use the integrator "glint_path", with an orthographic camera as well' in text
+    (folder / "curve.txt").write_text("-1 0 0 0.1\n0 0.2 0 0.1\n1 0 0 0.1\n")
+    curve = SCENE.replace(
+        '<shape type="rectangle">',
+        '<shape type="linearcurve"><string name="filename" value="curve.txt"/>',
+    )
+    scene = mi.load_string(curve.replace('name="spread" value="0"', 'name="spread" value="0.004"'))
+    rendering.render(scene, spp=1)
+    text = "".join(capfd.readouterr())
+    assert "as curves do not" in text and '"pixel_spread" is 0' not in text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")

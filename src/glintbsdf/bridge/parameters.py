@@ -461,7 +461,8 @@ class Parameters:
             )
             check_choice(self.owner, "material", material, ("none", *presets))
             raise
-        return found["eta"], found["k"]
+        # Taken out: a class made here lives on as part of a cycle, and what it knows with it.
+        return found.pop("eta"), found.pop("k")
 
 
 def check_to_uv(owner: str, to_uv: mi.ScalarAffineTransform3f) -> None:

@@ -54,17 +54,12 @@ def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:
 
 
 def _holds(material: mi.Object, bsdf: mi.BSDF) -> bool:
-    """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth."""
-    found = False
+    """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth.
 
-    class Look(mi.TraversalCallback):
-        def put(self, name: str, value: object, flags: int, *rest: object) -> None:
-            nonlocal found
-            if isinstance(value, mi.BSDF) and not found:
-                found = value is bsdf or _holds(value, bsdf)
-
-    material.traverse(Look())
-    return found
+    By Mitsuba's own traversal: a callback class that is made here and knows ``bsdf`` would keep it
+    alive, as every class is part of a cycle, and Dr.Jit records calls of every BSDF that is alive.
+    """
+    return any(node is bsdf for node in mi.traverse(material).hierarchy)
 
 
 def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:

@@ -120,6 +120,12 @@ _variant_option = click.option(
 _file = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
+def _refuse_same(output: Path, given: Path) -> None:
+    """Refuse to write over what is read."""
+    if output.exists() and output.samefile(given):
+        raise click.BadParameter(f'must not be the map itself (got "{output}")', param_hint="-o")
+
+
 def _define_option(meaning: str):
     return click.option(
         "-D",
@@ -131,11 +137,21 @@ def _define_option(meaning: str):
     )
 
 
+_sensor_option = click.option(
+    "-s",
+    "sensor",
+    default="",
+    metavar="SENSOR",
+    help="Sensor of the scene, by number from 0 or by id.  [default: the first]",
+)
+
+
 def _image_options(command):
     """Options of all commands that render images."""
     for option in reversed(
         [
             _variant_option,
+            _sensor_option,
             click.option(
                 "--spp",
                 type=click.IntRange(min=1),
@@ -181,6 +197,7 @@ def render(
     scene: Path,
     output: Path | None,
     variant: str,
+    sensor: str,
     spp: int | None,
     seed: int,
     denoise: bool,
@@ -195,7 +212,7 @@ def render(
     """
     where = Making(**how)
     _activate(variant)
-    subject = Subject(scene, definitions, variant, spp, seed, denoise, trim)
+    subject = Subject(scene, definitions, variant, spp, seed, denoise, trim, sensor)
     with where.cluster(variant) as cluster:
         make(subject, output or scene.with_suffix(".exr"), where, cluster)
 
@@ -246,6 +263,7 @@ def sequence(
     video: Path | None,
     rate: float,
     variant: str,
+    sensor: str,
     spp: int | None,
     seed: int,
     denoise: bool,
@@ -270,7 +288,7 @@ def sequence(
         folder.mkdir(parents=True, exist_ok=True)
     with where.cluster(variant) as cluster:
         for index, (values, name) in enumerate(zip(parameters, names, strict=True)):
-            subject = Subject(scene, values, variant, spp, seed, denoise, trim)
+            subject = Subject(scene, values, variant, spp, seed, denoise, trim, sensor)
             label = f"Frame {index + 1} of {len(names)}"
             make(subject, name, where.of_frame(index), cluster, label)
     if sheet:
@@ -287,20 +305,23 @@ def sequence(
 @commands.command()
 @click.argument("scene", type=_file)
 @_variant_option
+@_sensor_option
 @click.option(
     "--spp",
     type=click.IntRange(min=1),
     help="Samples per pixel, on which footprints depend.  [default: the scene's]",
 )
 @_define_option("Parameter of the scene; may be repeated.")
-def inspect(scene: Path, variant: str, spp: int | None, definitions: dict[str, str]) -> None:
+def inspect(
+    scene: Path, variant: str, sensor: str, spp: int | None, definitions: dict[str, str]
+) -> None:
     """Report what the glint BSDFs of the Mitsuba scene SCENE are asked for, and what they build.
 
     The part of each map and the sizes of footprints are what paths of the scene's own sensor and
     integrator have met, later bounces included; "--trim" is what "render --trim" would build.
     """
     _activate(variant)
-    findings = inspection.inspect(inspection.load(scene, definitions), spp)
+    findings = inspection.inspect(inspection.load(scene, definitions), spp, sensor)
     click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")
 
 
@@ -349,6 +370,7 @@ def pndf(
     are the relative L1 difference, the part of it that is the noise of the reference, and the time.
     """
     _activate(variant)
+    _refuse_same(output, map_file)
     with rendering.replacing(output) as unfinished:
         comparison = pndf_plot.compare(plugin, map_file, uv, sigma, res, definitions)
         rendering.save(comparison.drawing(), unfinished)
@@ -398,6 +420,7 @@ def synthesise(
 
     It is the map of glint_mip with the same parameters, which does not need it to be stored.
     """
+    _refuse_same(output, sample)
     normal_map = NormalMap.load(sample, map_type, height_scale, wrap_mode, "synthesise")
     with rendering.replacing(output) as unfinished:
         made = synthesis.synthesise(normal_map, **options, toroidal=wrap_mode == "repeat")

@@ -18,7 +18,7 @@ import click
 from glintbsdf.core.progress import progress
 from glintbsdf.scene import inspection, rendering
 from glintbsdf.scene.image import Image
-from glintbsdf.scene.package import Job, Package
+from glintbsdf.scene.package import Job, Package, inputs
 from glintbsdf.scene.storage import Checkpoint
 
 if TYPE_CHECKING:
@@ -187,6 +187,19 @@ class Subject:
     seed: int
     denoise: bool
     trim: bool
+    sensor: str = ""
+
+    def refuse_as_output(self, path: Path | None) -> None:
+        """Refuse to write over a file that the scene is made of.
+
+        Raises:
+            click.ClickException: names the file.
+        """
+        if path is None or not path.exists():
+            return
+        documents, files = inputs(self.scene, self.definitions)
+        if path.resolve() in {file.resolve() for file in (*documents, *files.values())}:
+            raise click.ClickException(f"{path} is a file of the scene: name another with -o")
 
 
 def make(
@@ -198,6 +211,8 @@ def make(
         click.ClickException: Ctrl-C; the file has what was done.
     """
     trimmed = None
+    for output in (path, making.live):
+        subject.refuse_as_output(output)
     with rendering.replacing(path) as unfinished:
         # Plugins show the progress of what they build while the scene loads. For a cluster nothing
         # is built here: the scene then serves to plan and to develop the image.
@@ -205,12 +220,17 @@ def make(
             inspected = inspection.load(subject.scene, subject.definitions)
             loaded = inspected.scene
             if not cluster:
-                trimmed = inspection.Trimmed(inspected, subject.spp)
+                trimmed = inspection.Trimmed(inspected, subject.spp, subject.sensor)
         else:
             loaded = rendering.load_scene(subject.scene, subject.definitions)
         missed = trimmed.missed if trimmed else lambda: False
+        if not subject.sensor and len(loaded.sensors()) > 1:
+            sensors = rendering.listed(loaded.sensors())
+            _tell(f"of the sensors {sensors} the first is rendered, -s names another")
         with (
-            rendering.Renderer(loaded, subject.spp, subject.denoise, missed) as renderer,
+            rendering.Renderer(
+                loaded, subject.spp, subject.denoise, missed, subject.sensor
+            ) as renderer,
             progress(label if cluster is None else f"{label} by {cluster}") as report,
         ):
             picture, interrupted = _produce(subject, renderer, making, cluster, report)
@@ -239,7 +259,13 @@ def _produce(
     if cluster or making.checkpoint:
         package = Package.of(subject.scene, subject.definitions)
         job = Job(
-            package, subject.variant, renderer.spp, subject.seed, subject.denoise, subject.trim
+            package,
+            subject.variant,
+            renderer.spp,
+            subject.seed,
+            subject.denoise,
+            subject.trim,
+            subject.sensor,
         )
         if making.checkpoint:
             checkpoint = Checkpoint(making.checkpoint, job.description())

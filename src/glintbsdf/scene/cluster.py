@@ -186,9 +186,11 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
         mi.set_variant(job.variant)
     with _spare_thread(threads):
         scene = job.package.load(store, deferred=job.trim)
-        missed = Trimmed(Inspected.of(scene), job.spp).missed if job.trim else lambda: False
+        missed = (
+            Trimmed(Inspected.of(scene), job.spp, job.sensor).missed if job.trim else lambda: False
+        )
     with ExitStack() as stack:
-        renderer = stack.enter_context(Renderer(scene, job.spp, job.denoise, missed))
+        renderer = stack.enter_context(Renderer(scene, job.spp, job.denoise, missed, job.sensor))
         _loaded[job] = renderer, stack.pop_all()
     return renderer
 

@@ -47,8 +47,9 @@ def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> I
     return Inspected.of(rendering.load_scene(filename, parameters, deferred=True))
 
 
-def survey(inspected: Inspected, spp: int | None = None) -> list[Domain | None]:
-    """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel.
+def survey(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Domain | None]:
+    """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel, by
+    the sensor ``which``, see :func:`~.chosen_sensor`.
 
     None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect as
     smooth surfaces meanwhile: later bounces of the paths go where theirs may go, if not as often.
@@ -58,7 +59,7 @@ def survey(inspected: Inspected, spp: int | None = None) -> list[Domain | None]:
         ValueError: see :func:`~.render`.
     """
     scene = inspected.scene
-    sensor = rendering.first_sensor(scene)
+    sensor = rendering.chosen_sensor(scene, which)
     sampler = sensor.sampler().clone()
     if spp is not None:
         sampler.set_sample_count(spp)
@@ -115,15 +116,16 @@ class Trimmed:
     Args:
         inspected: from :func:`load`.
         spp: samples per pixel of the rendering, None for the scene's.
+        which: the sensor, see :func:`~.chosen_sensor`.
 
     Attributes:
         sufficed (bool): nothing else has been asked for so far.
     """
 
-    def __init__(self, inspected: Inspected, spp: int | None = None) -> None:
+    def __init__(self, inspected: Inspected, spp: int | None = None, which: str = "") -> None:
         self.inspected = inspected
         self.sufficed = True
-        build_trimmed(inspected, survey(inspected, spp))
+        build_trimmed(inspected, survey(inspected, spp, which))
 
     def missed(self) -> bool:
         """Whether anything else has been asked for since the last call; then all is built now."""
@@ -216,18 +218,19 @@ def amounts(parts: dict[str, int]) -> list[str]:
     return [f"{size / 1e6:8.1f} MB  {name}" for name, size in notable.items()]
 
 
-def inspect(inspected: Inspected, spp: int | None = None) -> list[Finding]:
+def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Finding]:
     """What each BSDF is asked for and builds, and what of that ``render --trim`` would build.
 
     Args:
         inspected: from :func:`load`.
         spp: samples per pixel of the rendering, None for the scene's: footprints depend on it.
+        which: the sensor, see :func:`~.chosen_sensor`.
     """
-    domains = survey(inspected, spp)
+    domains = survey(inspected, spp, which)
     build_trimmed(inspected, domains)
     trimmed = [bsdf.parts() for bsdf in inspected.bsdfs]
     build(inspected)
-    domains = survey(inspected, spp)  # once more, by the glints themselves
+    domains = survey(inspected, spp, which)  # once more, by the glints themselves
     return [
         Finding(bsdf.owner, bsdf.name, bsdf.map_shape, domain, bsdf.parts(), parts, bsdf.left_out())
         for bsdf, domain, parts in zip(inspected.bsdfs, domains, trimmed, strict=True)

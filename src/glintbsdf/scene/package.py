@@ -181,19 +181,12 @@ class Package:
         Raises:
             RuntimeError: the XML cannot be read.
         """
-        path = Path(filename).absolute()
         definitions = dict(definitions or {})
-        config = mi.parser.ParserConfig(mi.variant())
-        state = mi.parser.parse_file(config, str(path), **definitions)
-        documents = [Path(str(name)).resolve() for name in state.files]
+        documents, files = inputs(filename, definitions)
         root = Path(os.path.commonpath([document.parent for document in documents]))
-        files = {}
-        for _, _, value in rendering.strings(state):
-            if value not in files and (found := _find(value, path.parent)) is not None:
-                files[value] = Content.of(found)
         return Package(
             tuple((d.relative_to(root).as_posix(), Content.of(d)) for d in documents),
-            tuple(files.items()),
+            tuple((value, Content.of(found)) for value, found in files.items()),
             tuple(definitions.items()),
         )
 
@@ -230,6 +223,24 @@ class Package:
                 target.write_bytes(store.find(content).read_bytes())
             main = inside(Path(folder), self.documents[0][0])
             return rendering.load_scene(main, dict(self.definitions), deferred, files)
+
+
+def inputs(
+    filename: str | Path, definitions: Mapping[str, str] | None = None
+) -> tuple[list[Path], dict[str, Path]]:
+    """The XML files of a scene, its own first, and all other files by the names in the XML.
+
+    Raises:
+        RuntimeError: the XML cannot be read.
+    """
+    path = Path(filename).absolute()
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(path), **(definitions or {}))
+    files: dict[str, Path] = {}
+    for _, _, value in rendering.strings(state):
+        if value not in files and (found := _find(value, path.parent)) is not None:
+            files[value] = found
+    return [Path(str(name)).resolve() for name in state.files], files
 
 
 def inside(folder: Path, name: str) -> Path:
@@ -302,6 +313,7 @@ class Job:
         seed (int): of the image.
         denoise, trim (bool): see :class:`~glintbsdf.scene.rendering.Renderer` and
             :class:`~glintbsdf.scene.inspection.Trimmed`.
+        sensor (str): which, see :func:`~glintbsdf.scene.rendering.chosen_sensor`.
     """
 
     package: Package
@@ -310,6 +322,7 @@ class Job:
     seed: int
     denoise: bool = False
     trim: bool = False
+    sensor: str = ""
 
     def description(self) -> dict[str, object]:
         """For checkpoints: what decides the image, in words and numbers."""

@@ -115,15 +115,26 @@ def pixel_angle(sensor: mi.Sensor) -> float:
     return float(np.asarray(dr.sqrt(dr.sqrt(squared))).item())
 
 
-def first_sensor(scene: mi.Scene) -> mi.Sensor:
-    """The sensor that a scene is rendered with.
+def chosen_sensor(scene: mi.Scene, which: str = "") -> mi.Sensor:
+    """The sensor that a scene is rendered with: by its number, from 0, or its id; the first one.
 
     Raises:
-        ValueError: no sensor.
+        ValueError: no sensor, or no such one.
     """
-    if not scene.sensors():
+    sensors = scene.sensors()
+    if not sensors:
         raise ValueError("the scene has no sensor")
-    return scene.sensors()[0]
+    if not which:
+        return sensors[0]
+    for number, sensor in enumerate(sensors):
+        if which in (str(number), sensor.id()):
+            return sensor
+    raise ValueError(f'no sensor "{which}" among {listed(sensors)}')
+
+
+def listed(sensors: list[mi.Sensor]) -> str:
+    """Sensors by number and id."""
+    return ", ".join(f'{number} "{sensor.id()}"' for number, sensor in enumerate(sensors))
 
 
 @contextmanager
@@ -179,6 +190,7 @@ class Renderer:
         denoise: the image will be denoised, see :mod:`glintbsdf.scene.denoising`.
         missed: called after each unit; whether the unit has asked for something that was not there,
             and is there now, so that the unit must be rendered again.
+        which: the sensor, see :func:`chosen_sensor`.
 
     Raises:
         ValueError: no sensor, or a mesh without the UVs that its BSDF needs; or ``denoise`` with
@@ -192,8 +204,9 @@ class Renderer:
         spp: int | None = None,
         denoise: bool = False,
         missed: Callable[[], bool] = lambda: False,
+        which: str = "",
     ) -> None:
-        self.scene, self.sensor = scene, first_sensor(scene)
+        self.scene, self.sensor = scene, chosen_sensor(scene, which)
         self.integrator = scene.integrator()
         self.denoise, self.missed = denoise, missed
         sampler = self.sensor.sampler().clone()
