@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import tempfile
@@ -217,6 +218,9 @@ class Renderer:
         self._stack = ExitStack()
 
     def __enter__(self) -> Renderer:
+        # Were what is left of former scenes freed while calls of their BSDFs are recorded, Dr.Jit
+        # would follow a pointer to nothing.
+        gc.collect()
         self.shared = self._stack.enter_context(sharing(self.scene, self.sensor, self.spp))
         if self.denoise:
             self.integrator = self._stack.enter_context(guided(self.integrator))
