@@ -6,10 +6,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
-from glintbsdf.bridge.parameters import Number, Parameters, check_to_uv, declared
+from glintbsdf.bridge.parameters import Parameters, check_to_uv, declared_range
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
@@ -97,12 +99,12 @@ class FootprintBSDF(mi.BSDF):
         callback.put("footprint_sigma", self.footprint_sigma, flags)
         callback.put("pixel_spread", self.pixel_spread, flags)
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not keys or "to_uv" in keys:
             check_to_uv(self.owner, self.to_uv)
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):
             value = getattr(self, key)
-            allowed = declared(self.owner, key) or Number()
+            allowed = declared_range(self.owner, key)
             check(
                 dr.all((value >= allowed.minimum) & (value <= allowed.maximum)),
                 self.owner,
@@ -118,7 +120,7 @@ class FootprintBSDF(mi.BSDF):
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
-        active: mi.Bool = True,
+        active: bool | mi.Bool = True,
     ) -> mi.Spectrum:
         return self.eval_pdf(ctx, si, wo, active)[0]
 
@@ -127,7 +129,7 @@ class FootprintBSDF(mi.BSDF):
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
-        active: mi.Bool = True,
+        active: bool | mi.Bool = True,
     ) -> mi.Float:
         return self.eval_pdf(ctx, si, wo, active)[1]
 
@@ -160,9 +162,10 @@ class FootprintBSDF(mi.BSDF):
     def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:
         """How slopes of a height map lie on the surface at ``si``; None for a map of normals, which
         are read in the shading frame as Mitsuba's ``normalmap`` reads them."""
-        if self.normal_map is None or not self.normal_map.is_height:
+        shape = self.map_shape
+        if shape is None or self.normal_map is None or not self.normal_map.is_height:
             return None
-        height, width, wrap_mode = self.map_shape
+        height, width, wrap_mode = shape
         return SlopeFrame.from_interaction(si, self.to_uv, width, height, wrap_mode == "mirror")
 
     def query(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Query:
@@ -271,7 +274,9 @@ class GlintBSDF(FootprintBSDF):
         self.pndf = self.create(domain)
         self.masking = self.pndf.masking(self.masking_name, self.height_correlated)
         self.smooth = self.pndf.smooth()
-        self.smooth_masking = self.smooth and self.smooth.masking("beckmann", False)
+        self.smooth_masking = None
+        if self.smooth is not None:
+            self.smooth_masking = self.smooth.masking("beckmann", False)
         self.color_conversion = None if self.pndf.colors is None else ColorConversion()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -284,7 +289,7 @@ class GlintBSDF(FootprintBSDF):
                 "specular_reflectance", self.specular_reflectance, mi.ParamFlags.Differentiable
             )
 
-    def parameters_changed(self, keys: list[str] = ()) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         super().parameters_changed(keys)
         for part in (self.pndf, self.masking, self.smooth, self.smooth_masking):
             if part is not None:
@@ -321,7 +326,7 @@ class GlintBSDF(FootprintBSDF):
         si: mi.SurfaceInteraction3f,
         sample1: mi.Float,
         sample2: mi.Point2f,
-        active: mi.Bool = True,
+        active: bool | mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         bs = dr.zeros(mi.BSDFSample3f)
         components = self.components(ctx)
@@ -359,7 +364,7 @@ class GlintBSDF(FootprintBSDF):
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
-        active: mi.Bool = True,
+        active: bool | mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Float]:
         value, pdf = mi.Spectrum(0), mi.Float(0)
         for count, (_, component) in enumerate(self.components(ctx)):
@@ -391,7 +396,7 @@ class GlintBSDF(FootprintBSDF):
         )
 
     def eval_diffuse_reflectance(
-        self, si: mi.SurfaceInteraction3f, active: mi.Bool = True
+        self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True
     ) -> mi.Spectrum:
         """The albedo for denoisers: tint and reflectance of the macroscopic surface.
 
@@ -438,7 +443,7 @@ class GlintBSDF(FootprintBSDF):
             return tint
         if self.pndf.intensity is not None:
             tint = self.pndf.intensity * tint
-        if self.color_conversion is not None:
+        if self.color_conversion is not None and self.pndf.colors is not None:
             mean = mi.Color3f(*self.pndf.colors.mean)
             tint = tint * self.color_conversion.eval(mean, si, active)
         return tint

@@ -84,8 +84,11 @@ COLORS = Kind("a name, an image file or an mi.Bitmap")
 INDICES = Number(1e-3, 1e3)
 EXTINCTION = Number(0.0, 1e3)
 
+#: Any finite number.
+ANY = Number()
+
 _SEED = Number(0, 2**32 - 1, whole=True)
-_MATERIAL = {
+_MATERIAL: Mapping[str, Number | Kind] = {
     "material": NAME,
     "eta": SPECTRUM,
     "k": SPECTRUM,
@@ -93,12 +96,12 @@ _MATERIAL = {
     "ext_ior": INDEX,
     "specular_reflectance": SPECTRUM,
 }
-_FOOTPRINT = {
+_FOOTPRINT: Mapping[str, Number | Kind] = {
     "to_uv": TRANSFORM,
     "footprint_sigma": Number(0, 100),
     "pixel_spread": Number(0, pi),
 }
-_MAP = {
+_MAP: Mapping[str, Number | Kind] = {
     "filename": TEXT,
     "bitmap": BITMAP,
     "data": TENSOR,
@@ -195,6 +198,12 @@ def declared(owner: str, name: str) -> Number | Kind | None:
     return PARAMETERS.get(owner, {}).get(name)
 
 
+def declared_range(owner: str, name: str, otherwise: Number = ANY) -> Number:
+    """The range of a parameter that is a number; ``otherwise`` where none is declared."""
+    found = declared(owner, name)
+    return found if isinstance(found, Number) else otherwise
+
+
 class Parameters:
     """Reads the properties of one plugin; every method raises ``ParameterError`` for bad values."""
 
@@ -220,7 +229,7 @@ class Parameters:
     def number(self, name: str, default: float) -> float:
         """A number of the declared range."""
         value = self.props.get(name, default)
-        allowed = declared(self.owner, name) or Number()
+        allowed = declared_range(self.owner, name)
         check(allowed.holds(value), self.owner, name, str(allowed), value)
         return float(value)
 
@@ -229,7 +238,7 @@ class Parameters:
         if name not in self.props:
             return default
         value = self.props[name]
-        allowed = declared(self.owner, name) or Number(0, 2**32 - 1, whole=True)
+        allowed = declared_range(self.owner, name, Number(0, 2**32 - 1, whole=True))
         check(allowed.holds(value), self.owner, name, str(allowed), value)
         return value
 
@@ -330,7 +339,7 @@ class Parameters:
             "a transform",
             value,
         )
-        to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)
+        to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)  # type: ignore[attr-defined]
         check_to_uv(self.owner, to_uv)
         return to_uv
 
@@ -362,7 +371,8 @@ class Parameters:
                     f'{self.owner}: "{name}" must be a readable image file (got "{value}": {error})'
                 ) from error
         check(isinstance(bitmap, mi.Bitmap), self.owner, name, requirement, value)
-        pixels = np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+        kind = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
+        pixels = np.array(bitmap.convert(*kind, False))  # type: ignore[attr-defined]
         pixels = pixels.reshape(-1, 3)
         bad = ~(np.isfinite(pixels) & (pixels >= 0)).all(axis=1)
         check(
@@ -410,7 +420,7 @@ class Parameters:
             mi.Properties.Type.Integer: lambda: [value],
             mi.Properties.Type.Float: lambda: [value],
             mi.Properties.Type.Color: lambda: list(value),
-            mi.Properties.Type.Spectrum: lambda: list(value.values),
+            mi.Properties.Type.Spectrum: lambda: list(value.values),  # type: ignore[attr-defined]
         }
         kind = self.props.type(name) if name in self.props else mi.Properties.Type.Float
         check(

@@ -25,7 +25,7 @@ def live_shapes() -> Iterator[mi.Shape]:
     """Every shape of the active variant that is alive."""
 
     def at(index: int) -> mi.Shape | None:
-        return dr.reinterpret_array(mi.ShapePtr, mi.UInt32(index))[0]
+        return mi.ShapePtr(dr.reinterpret_array(mi.ShapePtr, mi.UInt32(index)))[0]
 
     # Beyond the last place Dr.Jit raises an error, if there ever was a shape; else all are empty,
     # as is a place that is free again.
@@ -94,7 +94,7 @@ def uv_orientation(shape: mi.Shape) -> int:
             si = shape.eval_parameterization(mi.Point2f([0.2, 0.5, 0.8], [0.3, 0.5, 0.6]))
         except RuntimeError:
             return 0
-        signs = np.sign(np.array(dr.dot(dr.cross(si.dp_du, si.dp_dv), si.sh_frame.n)))
+        signs = np.sign(np.array(dr.dot(dr.cross(si.dp_du, si.dp_dv), mi.Vector3f(si.sh_frame.n))))
         # A rectangle's own parameterisation, unlike its intersections, knows of no flip.
         signs = -signs if shape.is_mesh() and shape.has_flipped_normals() else signs
         return int(signs[0]) if (signs == signs[0]).all() else 0

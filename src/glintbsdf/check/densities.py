@@ -34,7 +34,8 @@ def partition(points: Array) -> tuple[Array, Array]:
     any size; then cells are halved by number. Returns the cells (K, 2, 2: lower and upper corner),
     and the cell of each point.
     """
-    cells, cell_of = [], np.empty(len(points), np.int64)
+    cells: list[np.ndarray] = []
+    cell_of = np.empty(len(points), np.int64)
     open_cells = [(np.array([[-1.0, -1.0], [1.0, 1.0]]), np.arange(len(points)))]
     while open_cells:
         box, inside = open_cells.pop()

@@ -20,7 +20,7 @@ import multiprocessing
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from typing import Any, NamedTuple
@@ -155,7 +155,8 @@ def cases(seed: int, count: int, plugins: tuple[str, ...] = ()) -> Iterator[Case
             if rng.random() < 0.03:  # a slip of the pen
                 name = name[:-1] if rng.random() < 0.5 else name + "x"
             kind, given = value(declared.get(name))
-            if name in _COSTLY and declared[name].holds(given):
+            allowed = declared.get(name)
+            if name in _COSTLY and isinstance(allowed, Number) and allowed.holds(given):
                 given = min(given, _COSTLY[name])
             changes[name] = kind, given
         yield Case(plugin, changes)
@@ -243,9 +244,9 @@ def judged(case: Case, message: str) -> str:
     told = [line for line in lines if re.search(rf"{case.plugin}: ", line)]
     if len(told) != 1:
         return "no sentence: " + lines[-1]
-    groups = [case.changes]
+    groups: list[Collection[str]] = [case.changes]
     if {"filename", "bitmap", "flake_density"} & set(case.changes):
-        groups.append({"filename": 0, "bitmap": 0, "data": 0})
+        groups.append(("filename", "bitmap", "data"))
     if any(f'"{name}"' in told[0] for group in groups for name in group):
         return "refused"
     return "another parameter is named: " + told[0]
@@ -367,8 +368,9 @@ def fuzz(
     every = _known_cases(seed, count, variant, plugins)
     while running:
         ready = wait(list(running), timeout=1.0)
-        for connection in ready:
-            process, index, since = running[connection]
+        for connection, (process, index, since) in list(running.items()):
+            if connection not in ready:
+                continue
             try:
                 message = connection.recv()
             except EOFError:
@@ -420,4 +422,4 @@ def _work(connection, seed: int, count: int, variant: str, plugins: tuple[str, .
 if __name__ == "__main__":
     import sys
 
-    print(fuzz(int(sys.argv[1]), *map(int, sys.argv[2:3]), workers=2))
+    print(fuzz(int(sys.argv[1]), int(sys.argv[2]) if sys.argv[2:] else 0, workers=2))

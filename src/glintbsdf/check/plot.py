@@ -89,7 +89,7 @@ def compare(
         ParameterError: the plugin has no P-NDF to draw.
     """
     bsdf = mi.load_dict({"type": plugin, "filename": str(map_file), **_typed(parameters)})
-    pndf = getattr(bsdf, "pndf", None)
+    pndf = bsdf.pndf if hasattr(bsdf, "pndf") else bsdf
     check(hasattr(pndf, "normal_map"), "pndf", "type", "a glint BSDF with a normal map", plugin)
     normal_map = pndf.normal_map
 

@@ -12,11 +12,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import radians
+from types import ModuleType
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.check import suite
 from glintbsdf.check.suite import View
 from glintbsdf.footprint.gaussian import Footprint
@@ -115,7 +118,10 @@ def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
         dr.make_opaque(wo)
         value, pdf = bsdf.eval_pdf(ctx, si, wo)
         look(RADIANCE * suite.intensity(value), pdf)
-    return {"nan": int(dr.count(lost)[0]), "negative": int(dr.count(negative)[0])}
+    return {
+        "nan": int(mi.UInt32(dr.count(lost))[0]),
+        "negative": int(mi.UInt32(dr.count(negative))[0]),
+    }
 
 
 # --------------------------------------------------------------------------------------------------
@@ -151,12 +157,14 @@ def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> lis
     ]
 
 
-def mean_of_grid(bsdf: mi.BSDF, count: int) -> list[dict[str, float]]:
+def mean_of_grid(bsdf: GlintBSDF, count: int) -> list[dict[str, float | str]]:
     """``mass``: the mean, less one, of the density of ``glint_grid`` over its expectation.
 
     Over random places and normals, for footprints of some hundred microdetails, which lie apart.
     """
     pndf = bsdf.pndf
+    if not isinstance(pndf, Grid):
+        raise TypeError("the mean over places is known of glint_grid only")
     smooth = mi.MicrofacetDistribution(
         mi.MicrofacetType.Beckmann, pndf.alpha.x, pndf.alpha.y, sample_visible=False
     )
@@ -185,7 +193,7 @@ class DoubleMitsuba:
     package's mathematics looks them up when it is called.
     """
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         if name in ("Float", "TensorXf"):
             return {"Float": mi.Float64, "TensorXf": mi.TensorXd}[name]
         if name[-1] == "f" and name[-2].isdigit() and not name.startswith("Scalar"):
@@ -196,7 +204,7 @@ class DoubleMitsuba:
 class DoubleDrJit:
     """Dr.Jit's functions; the bits of a float are those of a float32 all the same."""
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         return getattr(dr, name)
 
     def reinterpret_array(self, kind: type, value: object) -> object:
@@ -208,7 +216,8 @@ class DoubleDrJit:
 @contextmanager
 def double_precision() -> Iterator[DoubleMitsuba]:
     """Let the package compute in float64; what is loaded in the block must be used in it alone."""
-    double = {"mi": DoubleMitsuba(), "dr": DoubleDrJit()}
+    double_mitsuba = DoubleMitsuba()
+    double = {"mi": double_mitsuba, "dr": DoubleDrJit()}
     single = {"mi": mi, "dr": dr}
     modules = [
         module
@@ -221,7 +230,7 @@ def double_precision() -> Iterator[DoubleMitsuba]:
     try:
         for module in modules:
             vars(module).update({k: v for k, v in double.items() if hasattr(module, k)})
-        yield double["mi"]
+        yield double_mitsuba
     finally:
         for module in modules:
             vars(module).update({k: v for k, v in single.items() if hasattr(module, k)})
@@ -242,7 +251,7 @@ class Queries:
     m: Array
     floor: Array
 
-    def value(self, bsdf: object, m: object) -> Array:
+    def value(self, bsdf: Any, m: ModuleType | DoubleMitsuba) -> Array:
         """D(m) G of a glossy BSDF, or the value of a diffuse one; ``m``: Mitsuba's names."""
         query = Query(Footprint(m.Point2f(self.uv), m.Vector2f(self.du), m.Vector2f(self.dv)))
         wi, wo = m.Vector3f(self.wi), m.Vector3f(self.wo)
@@ -277,7 +286,7 @@ def queries(bsdf: mi.BSDF, count: int) -> Queries:
     drawn = bs.pdf * 4 * dr.abs(dr.dot(bs.wo, m)) / m.z
     floor = drawn if isinstance(getattr(bsdf, "pndf", None), Grid) else drawn * 0
     valid = np.array(bs.pdf) > 0
-    columns = (si.uv, si.duv_dx, si.duv_dy, si.wi, bs.wo, m.xy, floor)
+    columns = (si.uv, si.duv_dx, si.duv_dy, si.wi, bs.wo, mi.Vector2f(m.x, m.y), floor)
     return Queries(*(np.array(x)[..., valid] for x in columns))
 
 
@@ -320,7 +329,7 @@ BRIGHT = 2.0**20
 
 def scene_of_squares(bsdf: mi.BSDF) -> mi.Scene:
     """Squares with ordinary, inverted and collapsed UVs, in the light of a lamp and a dim sky."""
-    scene = {
+    scene: dict[str, object] = {
         "type": "scene",
         "integrator": {"type": "glint_path", "max_depth": 3},
         "sensor": {

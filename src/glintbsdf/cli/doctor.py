@@ -59,8 +59,8 @@ def examine() -> list[Finding]:
         Finding("glintbsdf", __version__),
         Finding("Python", f"{platform.python_version()} ({sys.executable})"),
         Finding("System", f"{platform.system()} {platform.machine()}"),
-        Finding("Mitsuba", mi.__version__),
-        Finding("Dr.Jit", dr.__version__),
+        Finding("Mitsuba", str(mi.__version__)),
+        Finding("Dr.Jit", dr.__version__),  # type: ignore[attr-defined]  # its stubs lack it
         *map(_package, _PACKAGES),
         *(_package(name, use) for name, use in _OPTIONAL.items()),
         *_llvm(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 import drjit as dr
@@ -18,7 +18,7 @@ from glintbsdf import __version__
 from glintbsdf.bridge import llvm
 from glintbsdf.check import plot as pndf_plot
 from glintbsdf.cli.doctor import examine
-from glintbsdf.cli.making import Making, Subject, make, parse_image
+from glintbsdf.cli.making import Making, Subject, check_image, make, parse_image
 from glintbsdf.cli.making import options as making_options
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.maps import quilting as synthesis
@@ -203,7 +203,7 @@ def render(
     denoise: bool,
     trim: bool,
     definitions: dict[str, str],
-    **how: object,
+    **how: Any,
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
 
@@ -268,7 +268,7 @@ def sequence(
     seed: int,
     denoise: bool,
     trim: bool,
-    **how: object,
+    **how: Any,
 ) -> None:
     """Render frames of the Mitsuba scene SCENE, which differ in its parameters.
 
@@ -277,7 +277,7 @@ def sequence(
     """
     where = Making(**how)
     template = template or f"{scene.stem}_{{index:04}}.exr"
-    parse_image(None, None, Path(template))
+    check_image(Path(template))
     rows = frames.read_table(table) if table else []
     parameters = frames.frames_of(definitions, rows, together)
     names = frames.names_of(template, parameters)
@@ -414,7 +414,7 @@ def synthesise(
     wrap_mode: str,
     map_type: str,
     height_scale: float,
-    **options: float,
+    **options: Any,
 ) -> None:
     """Make a large normal map from the small normal or height map SAMPLE.
 

@@ -74,10 +74,12 @@ class Making:
             )
         from glintbsdf.scene.cluster import Cluster, Keys
 
-        if self.scheduler is None:
+        if self.workers is not None:
             cluster = Cluster.local(self.workers, self.memory_limit, variant, _tell)
-        else:
-            keys = self.tls_ca_file and Keys(self.tls_ca_file, self.tls_cert, self.tls_key)
+        elif self.scheduler is not None:
+            keys = None
+            if self.tls_ca_file and self.tls_cert and self.tls_key:
+                keys = Keys(self.tls_ca_file, self.tls_cert, self.tls_key)
             cluster = Cluster.at(self.scheduler, keys, _tell)
         with cluster:
             yield cluster
@@ -103,10 +105,16 @@ def parse_image(
     _context: click.Context, _parameter: click.Parameter, path: Path | None
 ) -> Path | None:
     """Accept only names of image files that can be written."""
-    if path is not None and path.suffix.lower() not in rendering.FORMATS:
+    if path is not None:
+        check_image(path)
+    return path
+
+
+def check_image(path: Path) -> None:
+    """Raise ``click.BadParameter`` unless an image file of this name can be written."""
+    if path.suffix.lower() not in rendering.FORMATS:
         allowed = " or ".join(rendering.FORMATS)
         raise click.BadParameter(f'must end in {allowed} (got "{path}")')
-    return path
 
 
 def _parse_memory(_context: click.Context, _parameter: click.Parameter, value: str) -> str:

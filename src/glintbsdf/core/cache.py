@@ -169,7 +169,7 @@ def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             dir=path.parent, prefix=_PREFIX, suffix=".tmp", delete=False
         ) as file:
             try:
-                np.savez(file, **arrays)
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # an array may have any name
                 file.close()
                 os.replace(file.name, path)
             except BaseException:

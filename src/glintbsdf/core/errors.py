@@ -13,7 +13,7 @@ def warn(message: str) -> None:
     if mi.variant() is None:  # Mitsuba's log speaks in a variant only
         print(message, file=sys.stderr)
     else:
-        mi.Log(mi.LogLevel.Warn, message)
+        mi.Log(mi.LogLevel.Warn, message)  # type: ignore[operator]  # an object in the stubs
 
 
 class ParameterError(ValueError):
@@ -56,5 +56,5 @@ def check_whole(
     value: object, fits: Callable[[int], bool], owner: str, parameter: str, requirement: str
 ) -> None:
     """Raise :class:`ParameterError` unless ``value`` is a whole number that ``fits``."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    check(whole and fits(value), owner, parameter, f"a whole number {requirement}", value)
+    fitting = isinstance(value, int) and not isinstance(value, bool) and fits(value)
+    check(fitting, owner, parameter, f"a whole number {requirement}", value)

@@ -62,9 +62,9 @@ def coherent_vertex(x: mi.Int, y: mi.Int, level: mi.Int) -> tuple[mi.UInt32, mi.
 
     The origin is a vertex of every level, and has no lowest set bit to shift to: its level is 2³¹.
     """
-    x, y = mi.UInt32(x), mi.UInt32(y)
-    either = x | y
+    bits = mi.UInt32(x), mi.UInt32(y)
+    either = bits[0] | bits[1]
     zeros = dr.select(either != 0, dr.tzcnt(either), 0)
     # The shift is arithmetic: of negative indices it keeps the sign.
-    x, y = (mi.UInt32(mi.Int(v) >> mi.Int(zeros)) for v in (x, y))
-    return x, y, dr.select(either != 0, mi.UInt32(level) + zeros, 1 << 31)
+    odd_x, odd_y = (mi.UInt32(mi.Int(v) >> mi.Int(zeros)) for v in bits)
+    return odd_x, odd_y, dr.select(either != 0, mi.UInt32(level) + zeros, 1 << 31)

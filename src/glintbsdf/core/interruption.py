@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 
 @contextmanager
@@ -20,7 +21,7 @@ def interruptible() -> Iterator[None]:
         return
     received = False
 
-    def receive(number: int, frame: object) -> None:
+    def receive(number: int, frame: FrameType | None) -> None:
         nonlocal received
         received = True
         signal.default_int_handler(number, frame)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from copy import copy
 from functools import partial
 from types import CellType, FunctionType, MethodType, ModuleType
+from typing import Any
 
 import drjit as dr
 
@@ -60,8 +61,9 @@ class Captured:
     """
 
     def __init__(self, function: Callable) -> None:
-        self.function, self.values = function, []
-        self.places = {}
+        self.function = function
+        self.values: list = []
+        self.places: dict[tuple[int, int], int] = {}
 
         def find(array):
             computed = array.state != dr.VarState.Evaluated
@@ -92,7 +94,7 @@ def identity(array) -> tuple[int, int]:
 # ------------------------------------------------------------------------------------------------
 
 
-def mapped(thing: object, replace: Callable, done: dict) -> object:
+def mapped(thing: Any, replace: Callable, done: dict) -> Any:
     """``thing`` with ``replace`` applied to all arrays in it: itself if none changes, else a copy.
 
     Looks into containers, functions and their enclosing variables, objects and their attributes.
@@ -112,7 +114,7 @@ def mapped(thing: object, replace: Callable, done: dict) -> object:
     return result
 
 
-def taken_apart(thing: object) -> tuple[list, Callable]:
+def taken_apart(thing: Any) -> tuple[list, Callable]:
     """The parts of a thing, and the function that makes its like of other parts."""
     kind = type(thing)
     if dr.is_array_v(thing):

@@ -12,7 +12,7 @@ section 3 (the Gaussian footprint).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -113,9 +113,13 @@ def is_literal_zero(value: float | mi.Float) -> bool:
     return value.state == dr.VarState.Literal and not dr.grad_enabled(value) and value[0] == 0
 
 
-def finite_or_zero(v: mi.Vector2f | mi.Vector3f) -> mi.Vector2f | mi.Vector3f:
+Vector = TypeVar("Vector", "mi.Vector2f", "mi.Vector3f")
+
+
+def finite_or_zero(v: Vector) -> Vector:
     """``v``, or the zero vector in lanes where a component is infinite or NaN."""
-    return dr.select(dr.all(dr.isfinite(v)), v, type(v)(0))
+    finite = mi.Bool(dr.all(dr.isfinite(v)))
+    return dr.select(finite, v, type(v)(0))
 
 
 def cone_partials(si: mi.SurfaceInteraction3f, width: mi.Float) -> tuple[mi.Vector2f, mi.Vector2f]:

@@ -136,7 +136,9 @@ def curved_interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Su
     transformation only.
     """
     if not hasattr(mi.RayFlags, "dNSdUV"):
-        return pi.compute_surface_interaction(ray, mi.RayFlags.Default | mi.RayFlags.NormalPartials)
+        # Other releases have other flags than the stubs know.
+        flags = mi.RayFlags.Default | mi.RayFlags.NormalPartials  # type: ignore[attr-defined]
+        return pi.compute_surface_interaction(ray, flags)
 
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV)
     is_mesh = si.shape.is_mesh()

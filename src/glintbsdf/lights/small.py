@@ -96,7 +96,7 @@ class SmallLights:
             self.distribution = mi.DiscreteDistribution(mi.Float(weights[others]))
 
         # What is known of an emitter is found by its number in Mitsuba's registry; 0 is none.
-        names = dr.reinterpret_array(mi.UInt32, pointers).numpy().astype(int)
+        names = mi.UInt32(dr.reinterpret_array(mi.UInt32, pointers)).numpy().astype(int)
         size = names.max(initial=0) + 1
         probability, small = np.zeros(size, np.float32), np.zeros(size, bool)
         centre, axes = np.zeros((size, 3), np.float32), np.zeros((size, 3, 3), np.float32)
@@ -117,7 +117,7 @@ class SmallLights:
         return dr.reinterpret_array(mi.UInt32, emitter)
 
     def choose(
-        self, random: mi.Point2f, active: mi.Bool = True
+        self, random: mi.Point2f, active: bool | mi.Bool = True
     ) -> tuple[mi.EmitterPtr, mi.Float, mi.Point2f]:
         """Choose one of the ``others``: the emitter, its probability, and what is left of
         ``random`` to sample it with."""
@@ -130,7 +130,7 @@ class SmallLights:
         scene: mi.Scene,
         si: mi.Interaction3f,
         ds: mi.DirectionSample3f,
-        active: mi.Bool = True,
+        active: bool | mi.Bool = True,
     ) -> mi.Float:
         """The density (1/sr) with which emitter sampling at ``si`` draws ``ds``."""
         if self.asked_count == 0:
@@ -138,7 +138,7 @@ class SmallLights:
         probability = dr.gather(mi.Float, self.probability, self.name(ds.emitter), active)
         return ds.emitter.pdf_direction(si, ds, active) * probability
 
-    def view(self, emitter: mi.EmitterPtr, p: mi.Point3f, active: mi.Bool = True) -> View:
+    def view(self, emitter: mi.EmitterPtr, p: mi.Point3f, active: bool | mi.Bool = True) -> View:
         """How an emitter is seen from ``p``."""
         name = self.name(emitter)
         small = dr.gather(mi.Bool, self.extended, name, active)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -165,7 +165,7 @@ class Decoding:
         )
         height = np.where(void, 0, height)
         # Mirrored about the border, the texel beyond is the border texel itself, as when clamped.
-        mode = "wrap" if self.wrap_mode == "repeat" else "edge"
+        mode: Literal["wrap", "edge"] = "wrap" if self.wrap_mode == "repeat" else "edge"
         padded = np.pad(height, 1, mode=mode)
         scale = float(self.height_scale) * float(self.strength)
         neighbours = (
@@ -348,8 +348,8 @@ def curl(normals: np.ndarray) -> tuple[float, float]:
 def _as_fractions(data: np.ndarray) -> np.ndarray:
     """Integers as fractions of their range, floats as they are; at least float32."""
     if data.dtype.kind in "ui":
-        working_type = np.float32 if data.dtype.itemsize <= 2 else np.float64
-        return data.astype(working_type) / working_type(np.iinfo(data.dtype).max)
+        working_type = np.dtype(np.float32 if data.dtype.itemsize <= 2 else np.float64)
+        return data.astype(working_type) / working_type.type(np.iinfo(data.dtype).max)
     return data.astype(np.result_type(data.dtype, np.float32), copy=False)
 
 

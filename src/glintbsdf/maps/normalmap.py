@@ -155,8 +155,16 @@ class NormalMap:
         Raises :class:`~.ParameterError`.
         """
         picture = Picture(_as_array(data, owner, parameter))
-        options = {"map_type": map_type, "height_scale": height_scale, "wrap_mode": wrap_mode}
-        return cls._decoded(picture, owner, parameter, flip_y, **options, **decoding)
+        return cls._decoded(
+            picture,
+            owner,
+            parameter,
+            flip_y,
+            map_type=map_type,
+            height_scale=height_scale,
+            wrap_mode=wrap_mode,
+            **decoding,
+        )
 
     @classmethod
     def from_bitmap(

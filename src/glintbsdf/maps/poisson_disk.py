@@ -58,7 +58,7 @@ def poisson_disk(count: int, rng: np.random.Generator) -> npt.NDArray[np.float32
             dart = rng.random((len(row), 2), dtype=np.float32)
             free = np.ones(len(row), bool)
             for i, j in near:
-                other = places[(row + i) % n, (column + j) % n] + np.float32((j, i))
+                other = places[(row + i) % n, (column + j) % n] + np.array((j, i), np.float32)
                 # Comparisons with NaN are false: an empty cell is not close.
                 free &= ~(np.square(other - dart).sum(axis=1) < 2)
             hits = np.flatnonzero(free)

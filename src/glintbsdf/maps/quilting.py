@@ -112,8 +112,8 @@ class Synthesis:
     def from_arrays(cls, normals, size: int, overlap: int, arrays) -> Synthesis:
         """The table again from :meth:`arrays`, for the same sample."""
         toroidal, best_only = (int(v) for v in arrays["numbers"])
-        tables = (arrays[name] for name in ("origins", "patch", "owners"))
-        return cls(normals, size, overlap, bool(toroidal), *tables, best_only)
+        origins, patch, owners = (arrays[name] for name in ("origins", "patch", "owners"))
+        return cls(normals, size, overlap, bool(toroidal), origins, patch, owners, best_only)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What to keep of the table, besides the sample, size and overlap."""
@@ -402,9 +402,9 @@ class _Quilt:
         mine = window.copy()
         for (axis, after), these in sides.items():
             start = int(self.steps[-1]) if after else 0
-            part = [these, slice(self.side), slice(self.side)]
-            part[1 + axis] = slice(start, start + self.overlap)
-            part = tuple(part)
+            sides_of_part = [slice(self.side), slice(self.side)]
+            sides_of_part[axis] = slice(start, start + self.overlap)
+            part = (these, *sides_of_part)
             there = self.source(rows[these, part[1], None], columns[these, None, part[2]])
             error = ((features[there] - features[source[part]]) ** 2).sum(axis=3)
             mine[part] &= _on_new_side(np.where(window[part], error, 0), axis, after)

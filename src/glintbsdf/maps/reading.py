@@ -83,7 +83,7 @@ def _read_exr(path: Path, map_type: str, layer: str, owner: str) -> Picture:
     """Read with OpenEXR: Mitsuba's own reader never returns on a machine with one CPU."""
     import OpenEXR
 
-    channels = {}
+    channels: dict[str, np.ndarray] = {}
     with OpenEXR.File(str(path), separate_channels=True) as file:
         for part in file.parts:
             # The channels of several parts are often told apart by the part's name alone.
@@ -147,12 +147,12 @@ def _read_tiff(path: Path) -> Picture:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
+        page = file.pages.first
         data = page.asarray()
         if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and data.ndim == 3:
             data = np.moveaxis(data, 0, -1)
         if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
-            data = np.moveaxis(page.colormap[:, data], 0, -1)
+            data = np.moveaxis(np.asarray(page.colormap)[:, data], 0, -1)
         elif page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
             data = _inverted(data, page.bitspersample)
         elif data.dtype.kind == "u" and page.bitspersample < 8 * data.dtype.itemsize:

@@ -159,9 +159,10 @@ class SlopeLobe:
             return self.sample_visible_ggx(w, sample2)
         # Along the direction e of w the slope is weighed by t; across it, given the slope along e,
         # it is a Gaussian of its own.
-        length = dr.norm(w.xy)
+        plane = mi.Vector2f(w.x, w.y)
+        length = dr.norm(plane)
         tilted = length > 0
-        e = dr.select(tilted, w.xy / dr.select(tilted, length, 1), mi.Vector2f(1, 0))
+        e = dr.select(tilted, plane / dr.select(tilted, length, 1), mi.Vector2f(1, 0))
         across = mi.Vector2f(-e.y, e.x)
         variance = 0.5 * self.width_squared(mi.Vector3f(e.x, e.y, 0))
         covariance = 0.5 * sum(dr.dot(e, v) * dr.dot(across, v) for v in (self.f, self.g))

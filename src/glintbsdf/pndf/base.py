@@ -20,7 +20,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +33,12 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet.frame import normal_from_projection
 from glintbsdf.microfacet.masking import BeckmannMasking, SmithMasking
+
+
+class Colors(Protocol):
+    """Colours of facets: all that the contract asks of them is their mean, linear RGB."""
+
+    mean: tuple[float, ...]
 
 
 class PNDF(ABC):
@@ -67,7 +73,7 @@ class PNDF(ABC):
     data: mi.TensorXf
     domain: Domain | None = None
     intensity: mi.Float | None = None
-    colors: object | None = None
+    colors: Colors | None = None
 
     # ----------------------------------------------------------------------------------------------
     #  The structure
@@ -114,7 +120,7 @@ class PNDF(ABC):
 
     def eval(
         self, m: mi.Vector2f, query: Query | Footprint, active: bool | mi.Bool = True
-    ) -> mi.Float:
+    ) -> mi.Float | mi.Color3f:
         """D(m), the density of projected normals over the unit disk; 0 outside of it.
 
         ``m``: projected normals, any number of them. ``query``: a query, or just a footprint in the
@@ -122,7 +128,7 @@ class PNDF(ABC):
         """
         return self._eval(m, Query.of(query), mi.Bool(active))
 
-    def eval_normal(self, m: mi.Vector3f, query: Query, active: mi.Bool) -> mi.Float:
+    def eval_normal(self, m: mi.Vector3f, query: Query, active: mi.Bool) -> mi.Float | mi.Color3f:
         """D of the unit normal ``m``."""
         return self.eval(mi.Vector2f(m.x, m.y), query, active)
 
@@ -140,7 +146,7 @@ class PNDF(ABC):
         return self._sample(Query.of(query), sample1, sample2, mi.Bool(active))
 
     @abstractmethod
-    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
+    def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float | mi.Color3f:
         """What :meth:`eval` returns."""
 
     @abstractmethod

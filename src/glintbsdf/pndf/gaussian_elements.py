@@ -74,7 +74,7 @@ class Gaussian:
     def root(self) -> tuple[mi.Vector2f, mi.Vector2f]:
         """Two vectors with the same covariance, (a, b) and (0, c); zero for a covariance of 0."""
         extended = self.xx > 0
-        inverse = dr.select(extended, dr.rsqrt(dr.select(extended, self.xx, 1)), 0)
+        inverse = mi.Float(dr.select(extended, dr.rsqrt(dr.select(extended, self.xx, 1)), 0))
         # Where xx vanishes so does xy, and the determinant says nothing of yy.
         c = dr.select(extended, dr.sqrt(self.determinant) * inverse, dr.sqrt(self.yy))
         return mi.Vector2f(self.xx * inverse, self.xy * inverse), mi.Vector2f(0, c)

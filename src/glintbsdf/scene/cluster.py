@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -45,6 +46,10 @@ from glintbsdf.scene.package import (
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.rendering import Renderer
 from glintbsdf.scene.units import Unit
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+    from distributed.scheduler import KilledWorker
 
 #: Seconds until a scheduler must have answered.
 PATIENCE = 8.0
@@ -105,6 +110,13 @@ class Answer:
     tile: Tile | None = None
     sums: np.ndarray | None = None
     trimmed_too_far: bool = False
+
+    @property
+    def part(self) -> tuple[Tile, np.ndarray]:
+        """Tile and sums of a unit of which nothing was missing."""
+        if self.tile is None or self.sums is None:
+            raise ValueError("the worker has not rendered the unit: files were missing")
+        return self.tile, self.sums
 
 
 class _Call:
@@ -240,10 +252,11 @@ class Cluster:
     Use :meth:`local` or :meth:`at`.
     """
 
-    def __init__(self, open_client: Callable[[ExitStack], object], tell: Callable[[str], None]):
+    client: Client  # within the block
+
+    def __init__(self, open_client: Callable[[ExitStack], Client], tell: Callable[[str], None]):
         self._open_client, self._tell = open_client, tell
         self._stack = ExitStack()
-        self.client = None
 
     @classmethod
     def local(
@@ -263,7 +276,7 @@ class Cluster:
             tell: what happens meanwhile.
         """
 
-        def open_client(stack: ExitStack) -> object:
+        def open_client(stack: ExitStack) -> Client:
             import dask
             from distributed import Client, Nanny, Scheduler, SpecCluster
 
@@ -330,7 +343,7 @@ class Cluster:
                 + ("give its three files" if scheme == "tls" else "the address must be tls://")
             )
 
-        def open_client(stack: ExitStack) -> object:
+        def open_client(stack: ExitStack) -> Client:
             from distributed import Client
             from distributed.security import Security
 
@@ -431,7 +444,7 @@ class _Rendering:
 
     def __init__(self, cluster: Cluster, job: Job) -> None:
         self.cluster, self.client, self.job = cluster, cluster.client, job
-        self.flying: dict[object, _Errand] = {}
+        self.flying: dict[Future, _Errand] = {}
         self.halves: dict[int, dict[tuple[int, ...], tuple[Tile, np.ndarray]]] = {}
         self.sent: Counter[tuple[str, Content]] = Counter()
         self.deaths: Counter[_Errand] = Counter()
@@ -465,7 +478,7 @@ class _Rendering:
             with contextlib.suppress(Exception):
                 self.client.cancel(list(self.flying), force=True)
 
-    def landed(self) -> list[object]:
+    def landed(self) -> list[Future]:
         """Futures that have come to an end; none where a second passes without."""
         from distributed import wait
 
@@ -488,7 +501,7 @@ class _Rendering:
             )
         self.flying[future] = errand
 
-    def received(self, future: object) -> tuple[Unit, Tile, np.ndarray] | None:
+    def received(self, future: Future) -> tuple[Unit, Tile, np.ndarray] | None:
         """What has become of an errand: a unit that is done, or None if there is more to do."""
         errand = self.flying.pop(future)
         if future.status == "error":
@@ -505,7 +518,7 @@ class _Rendering:
         if answer.trimmed_too_far:
             self.tell_once("trimmed structures did not suffice: built in full")
         if not errand.place:
-            return errand.unit, answer.tile, answer.sums
+            return errand.unit, *answer.part
         return self.joined(errand, answer)
 
     def failed(self, errand: _Errand, error: Exception) -> None:
@@ -537,7 +550,7 @@ class _Rendering:
         for number, half in enumerate(halves):
             self.submit(_Errand(half, (*errand.place, number)))
 
-    def lacked_memory(self, error: Exception) -> bool:
+    def lacked_memory(self, error: KilledWorker) -> bool:
         """Whether the worker that has died last was ended for its use of memory."""
         with _connected():
             events = self.client.get_events("worker-restart-memory")
@@ -549,16 +562,16 @@ class _Rendering:
         Halves are added in their own order, whichever came first.
         """
         found = self.halves[errand.unit.index]
-        found[errand.place] = answer.tile, answer.sums
+        found[errand.place] = answer.part
         place = errand.place
         while place:
-            both = [found.get((*place[:-1], number)) for number in range(2)]
-            if any(half is None for half in both):
+            first, second = (found.get((*place[:-1], number)) for number in range(2))
+            if first is None or second is None:
                 return None
             for number in range(2):
                 del found[(*place[:-1], number)]
             place = place[:-1]
-            found[place] = _sum(both)
+            found[place] = _sum([first, second])
         tile, sums = self.halves.pop(errand.unit.index)[()]
         return errand.unit, tile, sums
 

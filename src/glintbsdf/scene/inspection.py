@@ -77,7 +77,7 @@ def survey(inspected: Inspected, spp: int | None = None, which: str = "") -> lis
             rendering.footprints(scene, sensor, spp),
         ):
             passes.sums_of_samples(scene, sensor, scene.integrator(), film, few, spp, SEED, shared)
-        return [recorder and recorder.found() for recorder in recorders]
+        return [None if recorder is None else recorder.found() for recorder in recorders]
     finally:
         for bsdf in inspected.bsdfs:
             bsdf.watch = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from pathlib import Path, PurePosixPath
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf import __version__
 from glintbsdf.scene import rendering
 
 _DIGEST = re.compile(r"[0-9a-f]{40}")
@@ -220,7 +222,10 @@ class Package:
             for name, content in self.documents:
                 target = inside(Path(folder), name)
                 target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(store.find(content).read_bytes())
+                source = store.find(content)
+                if source is None:
+                    raise FileNotFoundError(f"{name} is missing")
+                target.write_bytes(source.read_bytes())
             main = inside(Path(folder), self.documents[0][0])
             return rendering.load_scene(main, dict(self.definitions), deferred, files)
 
@@ -260,7 +265,8 @@ def _find(value: str, folder: Path) -> Path | None:
     """The file that a string names, as Mitsuba finds it; None for other strings."""
     if not value or len(value) > 4096 or "\0" in value:
         return None
-    for path in (folder / value, Path(str(mi.file_resolver().resolve(value)))):
+    resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stubs
+    for path in (folder / value, Path(str(resolver.resolve(value)))):
         try:
             if path.is_file():
                 return path
@@ -278,19 +284,16 @@ def _find(value: str, folder: Path) -> Path | None:
 def versions() -> dict[str, str]:
     """What must be the same on all machines for their images to be: versions of packages, and of
     this one the source."""
-    import glintbsdf
-    import glintbsdf.plugins
-
     digest = hashlib.blake2b(digest_size=6)
-    for package in (glintbsdf, glintbsdf.plugins):
-        folder = Path(next(iter(package.__path__)))
+    for package in ("glintbsdf", "glintbsdf.plugins"):
+        folder = Path(next(iter(importlib.import_module(package).__path__)))
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode())
             digest.update(path.read_bytes())
     return {
-        "glintbsdf": f"{glintbsdf.__version__} (source {digest.hexdigest()})",
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
+        "glintbsdf": f"{__version__} (source {digest.hexdigest()})",
+        "mitsuba": str(mi.__version__),
+        "drjit": dr.__version__,  # type: ignore[attr-defined]  # its stubs lack it
     }
 
 

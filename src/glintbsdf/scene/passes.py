@@ -131,6 +131,7 @@ def _camera_rays(
     row = pixel // dr.opaque(mi.UInt32, tile.width)
     column = pixel - row * dr.opaque(mi.UInt32, tile.width)
     x, y = column + dr.opaque(mi.UInt32, tile.x), row + dr.opaque(mi.UInt32, tile.y)
+    place: mi.Point2f | mi.Vector2f
     if shared is None:
         place, sign = sampler.next_2d(), mi.Float(1)
     else:
@@ -155,7 +156,7 @@ def _camera_rays(
 
 
 def _sample(
-    integrator: mi.Integrator,
+    integrator: mi.SamplingIntegrator,
     scene: mi.Scene,
     sensor: mi.Sensor,
     sampler: mi.Sampler,
@@ -189,11 +190,10 @@ def _channels(
 ) -> list[mi.Float]:
     """What a film stores of samples of weight one."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        if mi.is_polarized:
-            radiance = mi.unpolarized_spectrum(radiance)
+        unpolarized = mi.unpolarized_spectrum(radiance) if mi.is_polarized else radiance
         alpha = dr.select(valid, mi.Float(1), mi.Float(0))
         count = film.create_block().channel_count()
-        return film.prepare_sample(radiance, wavelengths, count, weight=1.0, alpha=alpha)
+        return film.prepare_sample(unpolarized, wavelengths, count, weight=1.0, alpha=alpha)
     return [*colours(film, radiance, valid, wavelengths), mi.Float(1), *aovs]
 
 
@@ -257,11 +257,11 @@ def _sums(
         )
 
     state = (dr.zeros(mi.Int32, target.pixels), dr.zeros(mi.UInt32, target.pixels), *values)
-    _, _, *values = dr.while_loop(state=state, cond=more, body=add, label="Sums of samples")
-    values = [mi.Float(value) for value in values]
-    dr.eval(values)
+    _, _, *totals = dr.while_loop(state=state, cond=more, body=add, label="Sums of samples")
+    images = [mi.Float(total) for total in totals]
+    dr.eval(images)
     shape = (target.height, target.width)
-    return np.stack([np.asarray(value).reshape(shape) for value in values], axis=-1)
+    return np.stack([np.asarray(value).reshape(shape) for value in images], axis=-1)
 
 
 def _sums_of_a_film(

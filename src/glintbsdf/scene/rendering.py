@@ -53,8 +53,9 @@ def load_scene(
         dr.set_thread_count(2)
     parameters = dict(parameters or {})
     if not deferred and not files:
-        return mi.load_file(str(filename), **parameters)
-    config = mi.parser.ParserConfig(mi.variant())
+        # The names of a scene's parameters are known to nobody beforehand.
+        return mi.load_file(str(filename), **parameters)  # type: ignore[arg-type]
+    config = mi.parser.ParserConfig(mi.variant() or "")
     with folder_of_files(Path(filename).resolve().parent):
         state = mi.parser.parse_file(config, str(filename), **parameters)
         for node, key, value in strings(state):
@@ -65,7 +66,9 @@ def load_scene(
             if deferred and node.props.plugin_name() in DEFERRABLE:
                 node.props["deferred"] = True
         scene = mi.parser.instantiate(config, state)
-    return scene if isinstance(scene, mi.Scene) else scene[0]
+    if isinstance(scene, mi.Scene):
+        return scene
+    return scene[0]  # type: ignore[index]  # a list, or a tuple: an object in the stubs
 
 
 def strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str, str]]:
@@ -84,7 +87,7 @@ DEFERRABLE = ("glint_diffuse", "glint_elements", "glint_filtered", "glint_manifo
 @contextmanager
 def folder_of_files(folder: Path) -> Iterator[None]:
     """Look for a scene's files in ``folder`` first, as ``mi.load_file`` does."""
-    resolver = mi.file_resolver()
+    resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stubs
     before = [resolver[k] for k in range(len(resolver))]
     resolver.prepend(str(folder))
     try:
@@ -109,7 +112,8 @@ def pixel_angle(sensor: mi.Sensor) -> float:
     crop; the geometric mean of both axes. Parallel projections have 0.
     """
     middle = mi.Point2f(0.5)
-    ray, _ = sensor.sample_ray_differential(0.0, 0.5, middle, middle)
+    time, wavelength = mi.Float(0), mi.Float(0.5)
+    ray, _ = sensor.sample_ray_differential(time, wavelength, middle, middle)  # type: ignore[arg-type]
     if not ray.has_differentials:
         return 0.0
     squared = dr.squared_norm(ray.d_x - ray.d) * dr.squared_norm(ray.d_y - ray.d)
@@ -328,7 +332,13 @@ def produce(
 
 
 def picture(renderer: Renderer, image: Image) -> Picture:
-    """What is done of an image."""
+    """What is done of an image.
+
+    Raises:
+        ValueError: nothing is.
+    """
+    if image.sums is None:
+        raise ValueError("no unit of the image is done")
     return Picture(renderer.developed(image.sums), image.fraction, image.noise)
 
 

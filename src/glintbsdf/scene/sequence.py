@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import IO, cast
 
 import mitsuba as mi
 import numpy as np
@@ -227,10 +228,11 @@ def write_video(images: Sequence[Path], path: Path, rate: float) -> None:
     with tempfile.TemporaryFile() as messages:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
         try:
+            pipe = cast(IO[bytes], process.stdin)
             with contextlib.suppress(BrokenPipeError):  # it has ended, and says why below
                 for image in images:
-                    process.stdin.write(colours(image).tobytes())
-                process.stdin.close()
+                    pipe.write(colours(image).tobytes())
+                pipe.close()
             if process.wait():
                 messages.seek(0)
                 lines = messages.read().decode(errors="replace").strip().splitlines()

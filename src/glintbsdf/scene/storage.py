@@ -50,7 +50,7 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             before stays.
     """
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]  # an array may have any name
     write_bytes(path, hashlib.blake2b(buffer.getbuffer(), digest_size=_DIGEST).digest(), buffer)
 
 
@@ -112,7 +112,7 @@ class UnitFiles:
     def save(self, index: int, tile: Tile, sums: np.ndarray) -> None:
         """Keep the sums of a unit, and the tile that they belong to."""
         corners = np.array([tile.x, tile.y, tile.width, tile.height], np.int64)
-        write(self.path(index), {"tile": corners, "sums": sums, "index": np.int64(index)})
+        write(self.path(index), {"tile": corners, "sums": sums, "index": np.array(index, np.int64)})
 
     def load(self, index: int) -> tuple[Tile, np.ndarray] | None:
         """The tile and the sums of a unit, None if it is not there.
@@ -179,15 +179,20 @@ class Checkpoint:
             except Damaged:
                 path.unlink(missing_ok=True)
                 continue
+            if arrays is None:
+                continue
             image.count = int(arrays["count"])
             image.sums, image.odd = arrays["sums"], arrays["odd"]
             return
 
     def progressed(self, image: Image) -> None:
         """Called after each unit that is merged."""
+        if image.sums is None or image.odd is None:
+            return
         if image.count % UNITS_PER_SNAPSHOT and image.count < len(image.plan):
             return
-        arrays = {"count": np.int64(image.count), "sums": image.sums, "odd": image.odd}
+        count = np.array(image.count, np.int64)
+        arrays = {"count": count, "sums": image.sums, "odd": image.odd}
         write(self._snapshot(image.count), arrays)
         kept = sorted(self.folder.glob("sums-*.glint"))[-2:]
         for path in self.folder.glob("sums-*.glint"):

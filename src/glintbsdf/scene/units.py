@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import overload
 
 import mitsuba as mi
 
@@ -79,7 +80,7 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class Plan(Sequence):
+class Plan(Sequence[Unit]):
     """All units of an image, in the order in which they are merged: pass by pass, tile by tile.
 
     Attributes:
@@ -123,7 +124,15 @@ class Plan(Sequence):
     def __len__(self) -> int:
         return self.parts * len(self.tiles)
 
-    def __getitem__(self, index: int) -> Unit:
+    @overload
+    def __getitem__(self, index: int) -> Unit: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Unit]: ...
+
+    def __getitem__(self, index: int | slice) -> Unit | list[Unit]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
         if not 0 <= index < len(self):
             raise IndexError(index)
         tiles = self.tiles

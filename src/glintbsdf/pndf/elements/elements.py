@@ -146,12 +146,20 @@ class Mixture(PNDF):
     and implements the methods that raise ``NotImplementedError`` here.
     """
 
+    lattice: Lattice
+    map_cells: tuple[int, int]
+    lists: QuadLists | None
+    variance: float
+    sigma_r: mi.Float
+    element_bytes: int
+    wrap_mode: str
+
     #: ρ² of the cut where the footprint is a point: its elements are interpolated there, and the
     #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
     point_cut = 4.0
 
     #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
-    origin = (0.0, 0.0)
+    origin: tuple[float, ...] = (0.0, 0.0)
 
     def seen(self, kernel: TexelKernel) -> Callable:
         """What the footprint makes of elements, as a function ``(m, row, column, corner, active)``.
@@ -347,6 +355,8 @@ class Elements(Mixture):
     Raises :class:`~.ParameterError`.
     """
 
+    normal_map: NormalMap
+
     def __init__(
         self,
         normal_map: NormalMap,
@@ -385,8 +395,8 @@ class Elements(Mixture):
         self.lattice = self.texels
         if not self.aligned:
             clamped = self.wrap_mode == "clamp"
-            cells = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
-            self.lattice = Lattice(*cells, self.wrap_mode)
+            rows, columns = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
+            self.lattice = Lattice(rows, columns, self.wrap_mode)
 
         # By the side of the diagonal, so that elements with the same Jacobian are neighbours.
         self.places = sorted(

@@ -89,7 +89,8 @@ class Levels:
             for extreme in (dr.min, dr.max)
         )
 
-        tables, sizes, offsets, raw = [], [], [], base
+        tables: list[mi.Float] = []
+        sizes, offsets, raw = [], [], base
         while not tables or max(raw.counts) > 1:
             if tables:
                 raw = merged(merged(raw, 0, wrap_mode), 1, wrap_mode)

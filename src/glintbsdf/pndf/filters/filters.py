@@ -187,6 +187,8 @@ class Filtered(PNDF):
     Raises :class:`~.ParameterError`.
     """
 
+    normal_map: NormalMap
+
     maskings = ("smith", "none")
 
     def __init__(
@@ -268,7 +270,9 @@ class Filtered(PNDF):
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D: the normals visible from straight above."""
-        return self.lobe(query).sample_visible(mi.Vector3f(0, 0, 1), sample1, sample2).xy
+        above = mi.Vector3f(0, 0, 1)
+        normal = self.lobe(query).sample_visible(above, sample1, sample2)
+        return mi.Vector2f(normal.x, normal.y)
 
     def sample_visible(self, wi, query, sample1, sample2, active):
         """One of the normals of the lobe that the view sees."""

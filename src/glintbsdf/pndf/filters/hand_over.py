@@ -96,7 +96,9 @@ class HandOver(PNDF):
         """Check new data, and rebuild."""
         self.near.parameters_changed(keys)
         if not keys or "data" in keys:
-            self.far.data, self.far.normal_map = self.near.data, self.near.normal_map
+            self.far.data = self.near.data
+            if self.near.normal_map is not None:
+                self.far.normal_map = self.near.normal_map
             self.far.build(self.domain)
 
     def parts(self) -> dict[str, int]:

@@ -329,7 +329,7 @@ class LevelSamples(NamedTuple):
     offset: mi.UInt32
     pitch: mi.UInt32
     scale: mi.Vector2f
-    count: mi.Vector2f
+    counts: mi.Vector2f
     inverse_count: mi.Vector2f
     variance: mi.Float
     half_square: mi.Vector2f
@@ -432,7 +432,7 @@ class MomentPyramid:
 
         shapes = [axes_of(number) for number in range(self.first, self.top + 1)]
         windows = self.choose_windows(shapes, domain)
-        stored = []
+        stored: list[list[mi.Float]] = []
 
         def keep(level: list) -> None:
             k = len(stored)
@@ -565,8 +565,10 @@ class MomentPyramid:
         index = mi.UInt32(level - opaque(mi.Float, self.first))
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
+        offset, pitch = dr.gather(mi.Vector2u, self.layout, index)
         return LevelSamples(
-            *dr.gather(mi.Vector2u, self.layout, index),
+            offset,
+            pitch,
             mi.Vector2f(scale_x, scale_y),
             mi.Vector2f(columns, rows),
             mi.Vector2f(dr.rcp(columns), dr.rcp(rows)),
@@ -585,7 +587,7 @@ class MomentPyramid:
     def corners(self, position, grid: LevelSamples):
         """First and second sample (``mi.Vector2u``: column, row) of a level on either side of a
         position along each axis, and where between them it lies, from 0 to 1."""
-        count = grid.count
+        count = grid.counts
         place = (position + 0.5) * grid.scale + (-0.5 if self.periodic else BORDER - 0.5)
         corner = dr.floor(place)
         if self.wraps:

@@ -404,6 +404,15 @@ class Grid(PNDF):
     maskings = ("beckmann",)
     roughness_keys = ("alpha_u", "alpha_v")
 
+    alpha_u: mi.Float
+    alpha_v: mi.Float
+    detail_alpha_u: mi.Float
+    detail_alpha_v: mi.Float
+    density: mi.Float
+    size_variation: mi.Float
+    light_spread: mi.Float
+    max_anisotropy: mi.Float
+
     #: How the cells of a footprint are chosen; benchmarks put other ways in its place.
     covered_cells = CoveredCells
 

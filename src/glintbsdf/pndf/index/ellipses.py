@@ -35,7 +35,8 @@ class BlocksOfEllipses(BlocksOfQuads):
         """
         lower, upper = BlocksOfEllipses.extent(ellipse)
         meets = dr.all((lower <= centre + half) & (upper >= centre - half))
-        offset, p, q = ellipse[0] - centre, *ellipse[1:]
+        middle, p, q = ellipse
+        offset = middle - centre
         for tangent in (p, q, p + q, p - q):
             normal = mi.Vector2f(-tangent.y, tangent.x)
             a, b = dr.dot(normal, p), dr.dot(normal, q)

@@ -165,6 +165,8 @@ class NormalCells:
     of the map's normals: small cells where the normals, hence the queries, are many.
     """
 
+    divisions: int | mi.UInt32
+
     def __init__(self, lower, upper, slab_of_x: np.ndarray, cell_of_y: np.ndarray) -> None:
         """``slab_of_x`` (RESOLUTION), ``cell_of_y`` (S, RESOLUTION): tables over the rectangle."""
         self.lower, self.upper = (np.asarray(v, np.float32) for v in (lower, upper))
@@ -237,22 +239,22 @@ class NormalCells:
 
 
 class Span(NamedTuple):
-    """Blocks along one axis: ``count`` from ``first`` on, block 0 following the last of ``all``."""
+    """Blocks along one axis: ``size`` from ``first`` on, block 0 following the last of ``all``."""
 
     first: int
-    count: int
+    size: int
     all: int
 
     def place(self, block):
         """Which of the span a block is (``mi.UInt32``)."""
-        if self.count == self.all and self.first == 0:
+        if self.size == self.all and self.first == 0:
             return block
         first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
         return dr.select(block < first, block + all, block) - first
 
     def block(self, place):
         """The block at a place of the span (``mi.UInt32``)."""
-        if self.count == self.all and self.first == 0:
+        if self.size == self.all and self.first == 0:
             return place
         first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
         block = place + first
@@ -313,7 +315,7 @@ class QuadLists:
         it returns the new ``density``. Sums are differentiable in both modes.
         """
         rows, columns = self.window
-        count, width = dr.square(self.cells.count), dr.opaque(mi.UInt32, columns.count + 1)
+        count, width = dr.square(self.cells.count), dr.opaque(mi.UInt32, columns.size + 1)
         cell = self.cells.cell(m, active)
 
         def run_of(block_row, first, last, active):
@@ -399,8 +401,8 @@ class BlocksOfQuads(Blocks):
         """``shapes(row, column, active)`` returns the shapes of a stored quad."""
         self.lattice, self.shapes_of_quad = lattice, shapes
         self.window = window
-        self.rows, self.columns = window.rows.count, window.columns.count
-        self.mean_count, self.largest_entry = BLOCK**2, lattice.x.quads * BLOCK
+        self.rows, self.columns = window.rows.size, window.columns.size
+        self.mean_count, self.largest_entry = float(BLOCK**2), lattice.x.quads * BLOCK
 
     def count(self, block_row, block_column):
         """How many quads a block has."""

@@ -122,7 +122,7 @@ def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: floa
 
     ``rungs`` is the highest that there may be, ``limit`` the largest threshold that matters.
     """
-    cuts = []
+    cuts: list[tuple[float, list, int]] = []
     for rung in range(FIRST_RUNG, rungs + 1):
         usable = residuals[: rung + SHIFT]
         threshold = smallest_threshold(quads, usable, quads * RUNG**rung, limit)
@@ -240,6 +240,12 @@ class Ladder:
         the elements of a row of blocks. Of these, the arrays of all rungs stand one after the
         other; ``begin`` (K, …): where each begins.
     """
+
+    start: mi.UInt32
+    elements: mi.UInt32
+    first_of_row: mi.UInt32
+    slab_of_x: mi.UInt32
+    cell_of_y: mi.UInt32
 
     JOINED = ("start", "offset", "entries", "elements", "first_of_row", "slab_of_x", "cell_of_y")
 
@@ -532,7 +538,7 @@ class ClusteredManifold(Manifold):
         self.vertices = quads_alone
         if len(arrays["thresholds"]):
             self.ladder = Ladder(self.clusters, arrays)
-            self.vertices = dr.concat([quads_alone, mi.Float(arrays["normals"].ravel())])
+            self.vertices = dr.concat([mi.Float(quads_alone), mi.Float(arrays["normals"].ravel())])
 
     def element_normals(self, row, column, level, active):
         """Normals n_0^l…n_3^l of an element: a cluster, or a quad of the map at level 0."""

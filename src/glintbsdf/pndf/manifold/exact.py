@@ -51,6 +51,8 @@ class Manifold(TexelMesh, PNDF):
     follow the same triangles: averages over more than this roughness have the same derivatives.
     """
 
+    normal_map: NormalMap
+
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
 

@@ -267,7 +267,9 @@ def clipped_mean(corners: Corners, w_z, order: int):
     e1, e2 = edges[0], -edges[2]
 
     # The visible part of edge i runs from starts[i] to ends[i]: corners (λ1, λ2, m_z, q).
-    starts, ends, exist = [], [], []
+    starts: list[tuple] = []
+    ends: list[tuple] = []
+    exist = []
     for i, j in ((0, 1), (1, 2), (2, 0)):
         low, after_low, high, after_high, exists = visible_interval(
             q[i], q[j], z[i], z[j], chords[i], w_z
@@ -397,7 +399,8 @@ class ProjectedArea(FootprintArea):
             column = index - row * columns
             longest = mi.Float(0)
             for triangle in self.triangles(mi.Int(row), mi.Int(column), True):
-                for chord in Corners(*triangle, mi.Vector3f(0, 0, 1)).chords:
+                first, e1, e2 = triangle
+                for chord in Corners(first, e1, e2, mi.Vector3f(0, 0, 1)).chords:
                     longest = dr.maximum(longest, chord)
             longest = float(dr.max(longest)[0]) ** 0.5
         self.order = next(order for limit, order in ORDERS if longest <= limit)

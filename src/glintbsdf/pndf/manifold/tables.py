@@ -469,7 +469,7 @@ class NormalTables:
                 filled = np.flatnonzero(np.bincount(finest.indices, minlength=finest.shape[1]))
                 if 2 * finest.nnz + 4 * len(filled) * (np.prod(tiles_of(count)) + 1) <= BYTES:
                     break
-                count = tuple(count_near(n - 1) for n in count)
+                count = count_near(count[0] - 1), count_near(count[1] - 1)
         counts = level_counts(count)
         finest, coarser = without_empty_rows(finest.T.tocsr(), filled), refinements(counts)
 

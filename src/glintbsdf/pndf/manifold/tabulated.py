@@ -96,6 +96,13 @@ class TabulatedManifold(Manifold):
                 (self.lattice.y.quads, self.lattice.x.quads),
             )
 
+    @property
+    def known_tables(self) -> NormalTables:
+        """The tables, for what is asked only where there are any."""
+        if self.tables is None:
+            raise RuntimeError(f"{self.owner}: no tables have been built")
+        return self.tables
+
     def build_tables(self) -> dict[str, np.ndarray]:
         """The arrays of the tables."""
         return NormalTables.build(self.lattice, self.effective_triangles, self.normal_bounds())
@@ -110,7 +117,7 @@ class TabulatedManifold(Manifold):
     def error(self, kernel: TexelKernel, level: int) -> mi.Float:
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
         mean = dr.sqrt(kernel.sigma_u_given_v * kernel.sigma_v)
-        tables = self.tables
+        tables = self.known_tables
         grains = tables.grains[level][KERNELS.index(self.kernel)]
         nodes = [opaque(mi.Float, x) for x in grains], opaque(mi.Float, tables.spacing(level))
         minor = dr.sqrt(kernel.minor_variance)
@@ -121,7 +128,7 @@ class TabulatedManifold(Manifold):
 
         The truth spreads every triangle over the bins, weighed by the kernel at its quad's centre.
         """
-        kernel, bins = self.texel_kernel(Query.of(footprint)), self.tables.bins
+        kernel, bins = self.texel_kernel(Query.of(footprint)), self.known_tables.bins
         (mean,) = np.array(mi.Vector2f(kernel.mean)).T
         reach = np.array(dr.ravel(mi.Vector2f(kernel.reach_u, kernel.reach_v)))
         first, last = (np.floor(mean + sign * reach).astype(int) for sign in (-1, 1))
@@ -129,7 +136,7 @@ class TabulatedManifold(Manifold):
         row, column = (v.ravel() for v in np.meshgrid(y, x, indexing="ij"))
         offset = mi.Vector2f(mi.Float(column), mi.Float(row)) + 0.5 - mi.Vector2f(*map(float, mean))
         weight = kernel.value(offset).numpy()
-        touched, periods = weight > 0, self.tables.periods
+        touched, periods = weight > 0, self.known_tables.periods
         spread = bins.spread(
             self.effective_triangles, row[touched] % periods[0], column[touched] % periods[1]
         )
@@ -146,7 +153,7 @@ class TabulatedManifold(Manifold):
     def find_level(self, kernel: TexelKernel) -> mi.Int:
         """The level for a kernel, see :meth:`level`."""
         level = mi.Int(-1)
-        for k, variances in enumerate(self.tables.variances):
+        for k, variances in enumerate(self.known_tables.variances):
             variance = opaque(mi.Float, max(variances))
             room = variance <= MAX_NARROWING * VARIANCE[self.kernel] * kernel.minor_variance
             fits = room & (self.error(kernel, k) <= self.max_error)
@@ -177,7 +184,7 @@ class TabulatedManifold(Manifold):
 
     def make_node_kernel(self, query: Query) -> TexelKernel:
         """What :meth:`node_kernel` returns."""
-        tables, level = self.tables, self.level(query)
+        tables, level = self.known_tables, self.level(query)
         nodes = [
             mi.Float(n) * opaque(mi.Float, 1 / p)
             for n, p in zip(self.counts_of(level), tables.periods, strict=True)
@@ -279,8 +286,8 @@ class TabulatedManifold(Manifold):
         active = active & (level >= 0)
 
         # More numbers than the two given are wanted: hashed from them.
-        bits = [dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y)]
-        randoms = [uniform(v) for stream in range(5) for v in pcg3d(*bits, mi.UInt32(stream))]
+        a, b = (dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y))
+        randoms = [uniform(v) for stream in range(5) for v in pcg3d(a, b, mi.UInt32(stream))]
         choice, *of_nodes, l1, l2, bin_x, bin_y = randoms[:13]
 
         def pick(nodes, total, choice, at_y, at_x):
@@ -298,7 +305,7 @@ class TabulatedManifold(Manifold):
             kernel, active, pick, mi.Float(0), choice, mi.Int(0), mi.Int(0)
         )
         quad = []
-        finest = self.tables.counts[0]
+        finest = self.known_tables.counts[0]
         axes = zip(
             self.counts_of(level),
             node,
@@ -317,9 +324,10 @@ class TabulatedManifold(Manifold):
             place = (mi.Float(index) - 1 + u[0] + u[1] + u[2]) * spacing
             quad.append(axis.locate(floor_int(place))[1])
 
-        m = normal_in_quad(l1, l2, self.quad_normals(*quad, active), self.epsilon)
-        index, _ = self.tables.bins.index(m)
-        return self.tables.bins.normal(index, mi.Vector2f(bin_x, bin_y))
+        row, column = quad
+        m = normal_in_quad(l1, l2, self.quad_normals(row, column, active), self.epsilon)
+        index, _ = self.known_tables.bins.index(m)
+        return self.known_tables.bins.normal(index, mi.Vector2f(bin_x, bin_y))
 
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""

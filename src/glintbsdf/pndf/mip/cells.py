@@ -47,12 +47,9 @@ class CellAxis:
 
     def on(self, level: mi.UInt32, active: mi.Bool) -> CellsAlongAxis:
         """The axis as one level divides it, for each lane its own."""
-        return CellsAlongAxis(
-            self,
-            level == 0,
-            *(dr.gather(type(v), v, level, active) for v in (self.split, self.joined, self.period)),
-            active,
-        )
+        split, joined = (dr.gather(mi.UInt32, v, level, active) for v in (self.split, self.joined))
+        period = dr.gather(mi.Int, self.period, level, active)
+        return CellsAlongAxis(self, level == 0, split, joined, period, active)
 
 
 class CellsAlongAxis:
@@ -237,5 +234,5 @@ class LevelCells:
 def _packed_owners(owners: np.ndarray) -> np.ndarray:
     """Numbers from 0 to 3, sixteen to a word, the first lowest."""
     flat = owners.ravel().astype(np.uint32)
-    flat = np.append(flat, np.zeros(-len(flat) % 16, np.uint32)).reshape(-1, 16)
-    return np.bitwise_or.reduce(flat << (2 * np.arange(16, dtype=np.uint32)), axis=1)
+    words = np.append(flat, np.zeros(-len(flat) % 16, np.uint32)).reshape(-1, 16)
+    return np.bitwise_or.reduce(words << (2 * np.arange(16, dtype=np.uint32)), axis=1)

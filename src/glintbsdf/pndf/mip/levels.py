@@ -175,7 +175,7 @@ class Layout:
     @classmethod
     def of(cls, synthesis: Synthesis) -> Layout:
         inner = int(np.diff(synthesis.starts).min())
-        divisions = []
+        divisions: list[int] = []
         while inner / 2 ** (len(divisions) + 1) >= SMALLEST_GRID:
             divisions.insert(0, 2 ** (len(divisions) + 1))
         cells = [len(synthesis.patch)]

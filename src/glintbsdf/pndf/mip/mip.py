@@ -170,12 +170,12 @@ class Mip(PNDF):
     def make_kernel(self, footprint: Footprint, added: mi.Float | None = None) -> TexelKernel:
         """The footprint on the map's texels, widened by the variance ``added`` (texels²)."""
         size = self.synthesis.size
-        added = SIGMA_MIN**2 if added is None else added + SIGMA_MIN**2
+        variance = SIGMA_MIN**2 if added is None else added + SIGMA_MIN**2
         wrap_mode = self.wrap_mode
         if wrap_mode == "clamp":
             footprint = Footprint(dr.clip(footprint.uv, 0, 1), footprint.du, footprint.dv)
             wrap_mode = "mirror"
-        return TexelKernel("gaussian", footprint, size, size, wrap_mode, added=(added, added))
+        return TexelKernel("gaussian", footprint, size, size, wrap_mode, added=(variance, variance))
 
     def level(self, kernel: TexelKernel) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
         """Eq. 8: the levels below and above λ, and the weight of the one above (Eq. 9).
@@ -404,7 +404,7 @@ class Mip(PNDF):
             mi.Vector2f(kernel.shear * kernel.sigma_v, kernel.sigma_v),
         )
         if self.wrap_mode != "repeat":
-            vectors = tuple(v * sign for v in vectors)
+            vectors = vectors[0] * sign, vectors[1] * sign
         return vectors, dr.square(kernel.sigma_u_given_v * kernel.sigma_v)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -431,7 +431,7 @@ class Mip(PNDF):
         return MapShape(self.synthesis.size, self.synthesis.size, self.wrap_mode)
 
     @property
-    def normal_map(self) -> NormalMap:
+    def normal_map(self) -> NormalMap:  # type: ignore[override]  # made anew
         """The large map, made anew whenever it is asked for: it is for references and plots, and as
         large as what is saved by not storing it."""
         return self.synthesis.normal_map()
