@@ -28,7 +28,7 @@ from glintbsdf.core.errors import warn
 
 LIMIT = 4 << 30  # bytes
 _PREFIX = "glintbsdf-"  # the directory may hold files of others, which are never touched
-_STALE = 3600  # seconds after which an unfinished file can only be what a killed process left
+_STALE = 3600  # seconds; an older unfinished file can only be what a killed process left
 
 
 def directory() -> Path | None:
@@ -75,7 +75,7 @@ _guard = threading.Lock()
 
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """In the block, no other process of this machine builds ``path``.
+    """Let no other process of this machine build ``path`` during the block.
 
     Mitsuba makes plugins in parallel, and a thread that waits for a kernel may take up the next
     plugin meanwhile. So who holds a lock never waits for another one: it builds all the same. A
@@ -159,7 +159,7 @@ def _load(path: Path) -> dict[str, np.ndarray] | None:
 def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write a file beside its place, then move it there at once.
 
-    Without fsync: should the power fail, the checksums reveal what the disk has lost.
+    It does not wait for the disk: should the power fail, the checksums reveal what is lost.
     """
     if any(array.dtype.hasobject for array in arrays.values()):
         raise TypeError("only plain arrays can be cached, not arrays of Python objects")

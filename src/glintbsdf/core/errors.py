@@ -1,4 +1,7 @@
-"""The one sentence that tells a parameter error: who, which, what is allowed, what came."""
+"""The one sentence that reports a wrong parameter.
+
+It names the plugin, the parameter, what is allowed, and what came.
+"""
 
 from __future__ import annotations
 

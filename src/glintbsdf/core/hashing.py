@@ -41,8 +41,9 @@ def uniform(bits: mi.UInt32) -> mi.Float:
 def gaussian(bits: mi.UInt32) -> mi.Float:
     """A number of mean 0 and variance 1 from an integer: the sum of its four bytes, scaled.
 
-    By the central limit theorem nearly a standard normal number, within ±3.45 and off by at most
-    0.9 % in its distribution function; an inverse error function would cost several times as much.
+    By the central limit theorem this is nearly a standard normal number. It lies within ±3.45, and
+    its distribution function is off by at most 0.9 %. An inverse error function would cost several
+    times as much.
     """
     pairs = (bits & 0x00FF00FF) + ((bits >> 8) & 0x00FF00FF)
     total = (pairs & 0xFFFF) + (pairs >> 16)
@@ -65,6 +66,6 @@ def coherent_vertex(x: mi.Int, y: mi.Int, level: mi.Int) -> tuple[mi.UInt32, mi.
     bits = mi.UInt32(x), mi.UInt32(y)
     either = bits[0] | bits[1]
     zeros = dr.select(either != 0, dr.tzcnt(either), 0)
-    # The shift is arithmetic: of negative indices it keeps the sign.
+    # The shift is arithmetic: it keeps the sign of negative indices.
     odd_x, odd_y = (mi.UInt32(mi.Int(v) >> mi.Int(zeros)) for v in bits)
     return odd_x, odd_y, dr.select(either != 0, mi.UInt32(level) + zeros, 1 << 31)

@@ -13,8 +13,8 @@ from types import FrameType
 def interruptible() -> Iterator[None]:
     """Let Ctrl-C end the block as KeyboardInterrupt.
 
-    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, they raise an error
-    of their own in its place. Signals reach the main thread alone: in others nothing changes.
+    Where it comes while Dr.Jit records a loop or Mitsuba constructs a plugin, these raise an error
+    of their own instead. Signals reach the main thread alone: in other threads nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""What is told of work that turns out to be slow: a bar on a terminal, lines in a log."""
+"""Progress of work that turns out to be slow: a bar on a terminal, lines in a log."""
 
 from __future__ import annotations
 

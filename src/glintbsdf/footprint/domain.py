@@ -49,7 +49,7 @@ class Domain:
         return (2 * max(REACH.values()) * self.largest + 1) ** 2
 
     def widened(self) -> Domain:
-        """With a margin, for what a survey may have missed."""
+        """The domain with a margin, for what a survey may have missed."""
         columns, rows = (
             (first - MARGIN_TEXELS, last + MARGIN_TEXELS)
             for first, last in (self.columns, self.rows)
@@ -97,7 +97,7 @@ class Recorder:
     """Notes what queries touch; ``footprint = recorder(footprint, active)`` in a BSDF.
 
     Args:
-        shape (MapShape): of the map that is asked.
+        shape (MapShape): shape of the map that is asked.
     """
 
     NEVER = -(1 << 30)
@@ -130,11 +130,11 @@ class Recorder:
 class Gate:
     """Lets through what lies within a domain; ``footprint = gate(footprint, active)`` in a BSDF.
 
-    In place of another footprint comes one that the estimator can answer, whatever it may say: the
-    rendering is then worth nothing, and :meth:`missed` tells so.
+    It replaces any other footprint by one that the estimator can answer, whatever the answer may
+    be. The rendering is then worth nothing, and :meth:`missed` tells so.
 
     Args:
-        shape (MapShape): of the map that is asked.
+        shape (MapShape): shape of the map that is asked.
         domain (Domain): what may be asked.
     """
 
@@ -157,7 +157,7 @@ class Gate:
                 & (e.major <= domain.largest)
             )
             dr.scatter(self.misses, mi.UInt32(1), mi.UInt32(0), active & ~inside)
-        # The smallest footprint there is, in the middle: where there was any, it fits in.
+        # The smallest footprint, in the middle of the domain, fits in wherever there was any.
         width, height = self.shape.width, self.shape.height
         middle = mi.Point2f(
             (sum(domain.columns) + 1) / (2 * width), (sum(domain.rows) + 1) / (2 * height)

@@ -10,10 +10,10 @@ of unit integral:
   the axes.
 
 All three end at an edge, which moves with the footprint. What a footprint loses and gains there is
-part of the derivative of every average under it, though no value shows it: without, the integral of
-a Gaussian kernel would seem to fall by a tenth as its standard deviation grows by one. Derivatives
-are therefore those of an edge of some width (:data:`EDGE`), centred on the true one, so that those
-of the kernel's integral and of its mean are exact; values are those of the sharp edge.
+part of the derivative of every average under it, though no value shows it: without it, the integral
+of a Gaussian kernel would seem to fall by a tenth as its standard deviation grows by one. So
+derivatives see an edge of some width (:data:`EDGE`), centred on the true one; then the derivatives
+of the kernel's integral and of its mean are exact. Values see the sharp edge.
 
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
@@ -50,7 +50,7 @@ EDGE = {"gaussian": 1.0, "disk": 0.5, "box": 0.1}
 SIGMA_MIN = 1 / 128
 
 #: Largest standard deviation (maps) of a footprint. Repeated over the map, a Gaussian one map wide
-#: is uniform to 5e-9 (Poisson summation), 2e-3 with its cut at ρ = 3; a wider one only costs more.
+#: is uniform to 5e-9 (Poisson summation); cut at ρ = 3, to 2e-3. A wider one only costs more.
 SIGMA_MAX = 1.0
 
 #: Keeps square roots, and their derivatives, of a round footprint finite.
@@ -66,9 +66,10 @@ def difference_of_products(a, b, c, d):
 def limit_extent(du, dv):
     """Limit the principal standard deviations of Σ = du duᵀ + dv dvᵀ to :data:`SIGMA_MAX`.
 
-    ``du``, ``dv`` (``mi.Vector2f``, UV). Returns two vectors with the limited covariance: those
-    given where nothing is to be limited, principal axes elsewhere. Works on the factor, never on Σ,
-    so that a footprint 10⁸ times longer than the map is limited, and keeps its width.
+    ``du``, ``dv`` are in UV (``mi.Vector2f``). Returns two vectors with the limited covariance:
+    ``du`` and ``dv`` where nothing is to be limited, principal axes elsewhere. It works on the
+    factor, never on Σ, so that a footprint 10⁸ times longer than the map is limited, and keeps its
+    width.
     """
     longer = dr.squared_norm(du) >= dr.squared_norm(dv)
     a, b = dr.select(longer, du, dv), dr.select(longer, dv, du)
@@ -125,7 +126,8 @@ class TexelKernel:
         minor_variance (mi.Float): smaller eigenvalue of Σ, texels².
         mean (mi.Point2f): centre in texels, reduced to the first period of a repeated map.
         half_u, half_v (mi.Float): half extents in texels of the kernel's support.
-        reach_u, reach_v (mi.Float): of what counts: a little more where derivatives are taken.
+        reach_u, reach_v (mi.Float): half extents of what counts; a little more than the support
+            where derivatives are taken.
     """
 
     def __init__(
@@ -174,7 +176,7 @@ class TexelKernel:
     def cut_at(self, reach: float | mi.Float, edge: float = 0.0) -> None:
         """Cut the kernel at this Mahalanobis distance (the box: so many standard deviations).
 
-        ``edge``: the width that the cut has for derivatives, see :data:`EDGE`.
+        ``edge`` is the width that derivatives see, see :data:`EDGE`.
         """
         self.edge = edge if dr.grad_enabled((self.mean, self.du, self.dv)) else 0.0
         self.reach = self.cut = reach

@@ -4,7 +4,7 @@ The value of a pixel is the image filtered by the film's reconstruction filter, 
 each axis. A footprint of variance a Σ filters what it covers; what is left of the filter is drawn:
 samples lie about the pixel's centre as the filter itself would place them, contracted by √(1 − a),
 so that they vary by (1 − a) Σ. Variances add, so for a Gaussian filter the two together are the
-filter, whatever the share a; any other filter they match in mean and variance.
+filter, whatever the share a; with any other filter they agree in mean and variance.
 
 With footprints of Σ/N instead, as the usual scaling of ray differentials by 1/√N makes them, N
 samples cover the pixel by chance, whatever N: the error hardly falls.
@@ -55,7 +55,7 @@ class PixelFilter:
 
     def __init__(self, rfilter: mi.ReconstructionFilter) -> None:
         radius = rfilter.radius()
-        # The ends are where a box drops to zero: within by less than a sample would notice.
+        # A box drops to zero at its ends: we stay within them, by less than a sample would notice.
         x = np.linspace(-radius, radius, NODES) * (1 - 1e-6)
         profile = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), dtype=np.float64)
         step = x[1] - x[0]

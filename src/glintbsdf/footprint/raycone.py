@@ -118,8 +118,8 @@ class RayCone:
     def widened(self, d: mi.Vector3f, spread: mi.Float) -> RayCone:
         """The cone of direction ``d`` with ``spread`` radians added to the angle of each axis.
 
-        The two added directions are perpendicular, and of all such pairs the one nearest to
-        (``dp_x``, ``dp_y``): a lobe makes the cone diverge, so widths add, as those of ray cones do
+        The two added directions are perpendicular; of all such pairs they are the nearest to
+        (``dp_x``, ``dp_y``). A lobe makes the cone diverge, so widths add, as they do for ray cones
         (Akenine-Möller et al. 2021).
         """
         x, y = _nearest_orthonormal(d, self.dp_x, self.dp_y)

@@ -45,17 +45,17 @@ class Decoding:
             are three that are equal but for a few levels of 8 bits.
         height_scale: texels per unit of height; may be negative.
         wrap_mode: ``repeat``, ``mirror`` or ``clamp``.
-        encoding: of normals: ``signed``, components in [-1, 1]; ``unsigned``, stored as (n + 1)/2;
-            or ``auto``: that of the two in which the vectors are unit normals. Integers count as
-            fractions of their range.
+        encoding: how normals are stored. ``signed``: components in [-1, 1]; ``unsigned``: stored
+            as (n + 1)/2; ``auto``: whichever of the two makes the vectors unit normals. Integers
+            count as fractions of their range.
         flip_y: whether the second component of normals points the other way (DirectX).
         strength: factor on the slopes.
-        fill_voids: whether texels that hold nothing take the normal of the nearest that do: NaN and
-            infinite ones, those of alpha 0 where others have more, a height's -9999, -32767,
-            -32768, below -1e30 or what the file names, normals of length 0 and stored ones that
-            are black.
-        owner, parameter: named in errors.
-        void: the value of places without data, of a file that names one.
+        fill_voids: whether texels that hold nothing take the normal of the nearest texel that does.
+            A texel holds nothing where a value is NaN or infinite; where its alpha is 0 and others
+            have more; where a height is -9999, -32767, -32768, below -1e30 or the value that the
+            file names; where a normal has length 0, or is stored as black.
+        owner, parameter: the names that errors give.
+        void: the value that the file gives to places without data, if it names one.
         notes: what has been decided.
         reads_height: whether it was a height.
 
@@ -88,7 +88,8 @@ class Decoding:
         """H x W x 2 projected normals, x² + y² < 1, of H x W x C values, C = 1…4.
 
         Raises:
-            ParameterError: no valid map, or values without a normal; names the first place.
+            ParameterError: the values are no valid map, or some have no normal; the message names
+                the first place.
         """
         void = np.zeros(data.shape[:2], bool)
         if data.shape[2] == 4:
@@ -125,7 +126,7 @@ class Decoding:
     # ----------------------------------------------------------------------------------------------
 
     def is_height(self, data: np.ndarray) -> bool:
-        """Whether the channels hold a height: by ``map_type``, or by their being alike."""
+        """Whether the channels hold a height: ``map_type`` says so, or they are alike."""
         channels = data.shape[2]
         if self.map_type == "normal" or (self.map_type == "auto" and channels == 2):
             return False
@@ -151,7 +152,7 @@ class Decoding:
     def of_height(self, height: np.ndarray, void: np.ndarray) -> np.ndarray:
         """``n ∝ (-∂h/∂x, -∂h/∂y, 1)`` by central differences, in texels.
 
-        A texel beside a void one has the difference to its other neighbour.
+        A texel beside a void one takes the difference to its other neighbour.
         """
         self.check(not self.flip_y, "false for a height, which has no green", True, "flip_y")
         if self.fill_voids:
@@ -232,7 +233,7 @@ class Decoding:
         return xy if self.strength == 1 else self.strengthened(xy)
 
     def is_stored(self, vectors: np.ndarray, dtype: np.dtype) -> bool:
-        """Whether normals are stored as (n + 1)/2: by ``encoding``, or by the vectors."""
+        """Whether normals are stored as (n + 1)/2: ``encoding`` says so, or the vectors do."""
         if self.encoding != "auto":
             return self.encoding == "unsigned"
         unsigned_type = np.issubdtype(dtype, np.unsignedinteger)
@@ -275,7 +276,7 @@ class Decoding:
     # ----------------------------------------------------------------------------------------------
 
     def filled(self, normals: np.ndarray, void: np.ndarray) -> np.ndarray:
-        """``normals`` with those of void texels replaced by the nearest that are not."""
+        """``normals``, where void texels have taken the normal of the nearest one that is not."""
         count = int(np.count_nonzero(void))
         if not count:
             return normals
@@ -322,9 +323,9 @@ def curl(normals: np.ndarray) -> tuple[float, float]:
     """How far projected normals are from those of any height, as they are and with y reversed.
 
     The slopes p and q of a height have ``∂p/∂y = ∂q/∂x``. Returned is the mean of the difference of
-    both, over the mean of the sum of their amounts, in [0, 1]: 0 for a height; with y reversed the
-    sum takes the place of the difference. Maps of more than a million texels are judged by a band
-    of rows. (0, 0) for a map without any such derivative.
+    both, over the mean of the sum of their amounts, in [0, 1]. It is 0 for a height; with y
+    reversed the sum takes the place of the difference. Maps of more than a million texels are
+    judged by a band of rows. A map without any such derivative gives (0, 0).
     """
     height, width = normals.shape[:2]
     rows = min(height, max(3, (1 << 20) // width))
@@ -361,7 +362,7 @@ def _of_type(fractions: np.ndarray, like: np.ndarray) -> np.ndarray:
 
 
 def _unit(data: np.ndarray) -> float:
-    """What counts as the range of the values: of integers that of their type."""
+    """What counts as the range of the values; for integers it is the range of their type."""
     if data.dtype.kind in "ui":
         return float(np.iinfo(data.dtype).max)
     finite = data[np.isfinite(data)]
@@ -379,7 +380,7 @@ def _differences(data: np.ndarray) -> np.ndarray:
 def _alike(data: np.ndarray) -> bool:
     """Whether three channels are equal up to noise: all but 1 % of texels within a few levels.
 
-    Normals are never: where x = y = z they lean by 55 degrees.
+    Those of a normal map never are: where x = y = z, normals lean by 55 degrees.
     """
     return bool(np.mean(_differences(data) > _FEW_LEVELS) <= 0.01)
 
@@ -387,7 +388,7 @@ def _alike(data: np.ndarray) -> bool:
 def _tinted(data: np.ndarray) -> bool:
     """Whether three channels show one picture in different shades: correlations above 0.98.
 
-    Those of unit normals cannot all grow together.
+    The components of unit normals cannot all grow together.
     """
     values = data.reshape(-1, 3)[:: max(1, data.shape[0] * data.shape[1] // 65536)]
     values = values[np.isfinite(values).all(axis=1)].astype(np.float64)
@@ -424,8 +425,8 @@ def _is_swizzled(colours: np.ndarray, alpha: np.ndarray) -> bool:
 def _look_stored(vectors: np.ndarray) -> bool:
     """Whether fractions look like normals stored as (n + 1)/2 rather than normals as they are.
 
-    Stored ones are nowhere negative. Of three components, that reading is right in which lengths
-    are nearer to 1; of two, that which lies in the disk and leans less.
+    Stored normals are nowhere negative. With three components, the reading whose lengths are nearer
+    to 1 is right; with two, the reading that lies in the disk and leans less.
     """
     sample = vectors.reshape(-1, vectors.shape[2])
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -442,7 +443,7 @@ def _look_stored(vectors: np.ndarray) -> bool:
 
 
 def _look_plain(vectors: np.ndarray) -> bool:
-    """Whether unsigned numbers can only be components as they are: unit vectors, and else none."""
+    """Whether unsigned numbers are unit vectors as they are, and as stored ones are not."""
     if vectors.shape[2] != 3:
         return False
     sample = vectors.reshape(-1, 3).astype(np.float64)

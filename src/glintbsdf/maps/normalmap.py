@@ -2,7 +2,7 @@
 
 A normal is stored as its projection on the unit disk, ``(n_x, n_y)``, with ``n_z > 0`` implied.
 
-Conventions, those of Mitsuba's ``bitmap`` and ``normalmap``:
+The conventions are those of Mitsuba's ``bitmap`` and ``normalmap``:
 
 * row ``i``, column ``j`` has its texel centre at ``uv = ((j + 1/2) / W, (i + 1/2) / H)``: row 0 is
   at ``v = 0``, ``n_x`` leans along ``u`` and ``n_y`` along ``v``;
@@ -15,7 +15,7 @@ What ``auto`` has decided is in :attr:`NormalMap.notes`; decisions that another 
 contradict are logged as warnings by the logger ``glintbsdf.maps``, others as information. See
 :mod:`~glintbsdf.maps.decoding`.
 
-Needs NumPy only: file readers are imported when a file of their kind is read.
+This module needs NumPy only: file readers are imported when a file of their kind is read.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ logger = logging.getLogger("glintbsdf.maps")
 
 _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
 
-#: The curl of normals says that green points the other way where it is so many times less then.
+#: Green points the other way where that makes the curl of the normals so many times smaller.
 _DECISIVE = 4
 
 

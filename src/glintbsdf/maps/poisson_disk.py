@@ -13,10 +13,10 @@ from math import ceil, sqrt
 import numpy as np
 import numpy.typing as npt
 
-#: Points per cell. Saturation, which takes many more throws, is at about 0.33.
+#: Points per cell. Many more throws would reach saturation, at about 0.33.
 FILL = 0.29
 
-#: Rounds of throws, at most. At this density twenty are enough, as measured up to a million points.
+#: Rounds of throws, at most. At this density twenty have been enough for a million points.
 MAX_ROUNDS = 1000
 
 #: Standard deviation of the neighbourhood in which areas are balanced, in mean distances √(1/N).
@@ -73,8 +73,8 @@ def balanced_areas(places: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Areas (cells) for the points of :func:`poisson_disk`, n×n, 0 in cells without a point.
 
     Seen through a Gaussian wider than ``BALANCE`` mean distances, points with these areas cover
-    the square evenly: through one of 2.6 mean distances, their mass differs from one by less than
-    1e-3, where equal areas leave a tenth. They sum to n².
+    the square evenly. Through one of 2.6 mean distances, their mass differs from one by less than
+    1e-3; points of equal areas would leave a tenth. The areas sum to n².
     """
     from scipy.ndimage import gaussian_filter, map_coordinates  # only flakes pay for it
 

@@ -1,10 +1,10 @@
 """A large normal map put together from patches of a small sample, without storing it.
 
 Tan, Zhu, Xu, Meng, Wang and Yan, "Real-Time Microstructure Rendering with MIP-mapped Normal Map
-Samples" (2022), section 5.1.1, which follows the image quilting of Efros and Freeman (2001). What
-is put together are the lobes of the sample's texels: a normal each, and its Jacobian. The large map
-is divided into cells; each cell shows a patch of the sample, which reaches into the next cells by
-the overlap. There, a cut of least error (Eq. 7) decides which of the patches each texel belongs to.
+Samples" (2022), section 5.1.1, which follows the image quilting of Efros and Freeman (2001). The
+method puts together the lobes of the sample's texels: each has a normal and its Jacobian. The large
+map is divided into cells. Each cell shows a patch of the sample, which reaches into the next cells
+by the overlap. There, a cut of least error (Eq. 7) decides to which patch each texel belongs.
 
 The map itself never exists: it follows from the patch of every cell and, for the texels of the
 overlaps, from whose patch they belong to. Arrays are indexed (row, column), in texels.
@@ -94,7 +94,7 @@ class Synthesis:
         owners: n×n×L, for the texels of a cell's overlaps, whose patch they belong to: 0 for the
             cell's own, or the sum of :data:`BEFORE_X` and :data:`BEFORE_Y`. The texels are the
             first ``overlap`` rows of the cell, then the first columns of its other rows; L is
-            that of the largest cell.
+            their number in the largest cell.
         best_only: number of cells for which no patch was within the tolerance, so that the best
             was taken.
     """
@@ -267,23 +267,23 @@ def synthesise(
     """Make a large map from patches of a sample (section 5.1.1, steps 1 to 6).
 
     Patches are chosen from :data:`REUSE` × sample area / patch area places in the sample, drawn at
-    random, or from all places where there are fewer: structures built per patch, such as those of
-    :class:`~.Mip`, then stay small whatever the output's size. No cell shows much of
+    random, or from all places where there are fewer. Structures that are built per patch, as
+    :class:`~.Mip` builds them, then stay small whatever the output's size. No cell shows much of
     what cells nearby show, for the eye is quick to find what repeats side by side.
 
     Args:
         sample: the small map.
         output_size: texels of the large map along each axis, larger than a patch.
         patch_size: texels of a patch along each axis, fewer than the sample's.
-        overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2. Default: an
-            tenth of a patch. (The paper has 2 texels of 64; seams of smooth maps show then.)
+        overlap: texels that neighbouring patches share, 1 ≤ overlap < patch_size/2. The default is
+            a tenth of a patch. (The paper has 2 texels of 64; then seams of smooth maps show.)
         balance: α of Eq. 7, in [0, 1]: 1 compares normals alone, 0 their Jacobians.
         tolerance: patches are chosen at random among those whose mean error over the overlap is at
             most this multiple of the mean error between neighbouring texels of the sample; where
             there is none, the best is taken.
         toroidal: make the map's opposite edges fit.
         seed: another one gives another map, in [0, 2⁶³).
-        owner: whom errors name.
+        owner: the name that errors give.
 
     Raises :class:`~.ParameterError`.
     """
@@ -332,9 +332,9 @@ class _Quilt:
     def mean_errors(self, axis: int) -> np.ndarray:
         """How any two patches fit side by side, by their mean error (Eq. 7) over the overlap.
 
-        As an array (length, patch before, patch after): a patch is cut to one of two lengths. Of
-        what either shows there all counts, though cuts with others may take a corner away. Known
-        once for all, patches cost nothing to choose.
+        The result is an array (length, patch before, patch after): a patch is cut to one of two
+        lengths. All that either patch shows there counts, though cuts with others may take a corner
+        away. As these errors are known once and for all, choosing patches costs nothing.
         """
         first = self.overlaps(axis, 0)
         lengths = range(self.steps.min(), self.steps.max() + 1)
@@ -354,8 +354,8 @@ class _Quilt:
     def fronts(self) -> list[np.ndarray]:
         """Cells in an order in which those above, to the left and above right come first.
 
-        Those of one front are more than :data:`APART` cells from each other, also around the edges,
-        and do not depend on each other. Where there are few cells, they come one by one.
+        The cells of one front are more than :data:`APART` cells from each other, also around the
+        edges, and do not depend on each other. Where there are few cells, they come one by one.
         """
         y, x = np.indices((self.count, self.count)).reshape(2, -1)
         slope = APART + 1 if self.count > APART * (APART + 2) else self.count
@@ -425,9 +425,9 @@ class _Quilt:
     def repeats(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Which patches show much of what cells nearby show already: N×P.
 
-        Those whose place in the sample is less than half a patch off along both axes from that of a
-        neighbour, a quarter from those of the next cells but one, and so on to :data:`APART` cells;
-        without a choice, none.
+        Such a patch has a place in the sample that is less than half a patch off, along both axes,
+        from the place of a neighbour; or less than a quarter from the places of the next cells but
+        one, and so on up to :data:`APART` cells. Where no choice would be left, there is none.
         """
         result = np.zeros((len(y), len(self.origins)), bool)
         for above, beside in product(range(-APART, APART + 1), repeat=2):
@@ -438,7 +438,7 @@ class _Quilt:
         return result & ~result.all(axis=1, keepdims=True)
 
     def source(self, row, column) -> np.ndarray:
-        """Index of the sample's texel that a texel shows by now, anything where none is placed."""
+        """Index of the sample's texel that a texel shows by now; any index where none is placed."""
         row, column = np.broadcast_arrays(row, column)
         owner = self.owner[row, column]
         place = []

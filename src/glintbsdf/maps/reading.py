@@ -53,7 +53,7 @@ def read(path: Path, map_type: str, layer: str, owner: str) -> Picture:
     """Read an image file by the library that reads its kind best.
 
     Args:
-        path: of an existing file.
+        path: an existing file.
         map_type: ``auto``, ``normal`` or ``height``: decides which layer is preferred.
         layer: the layer of an OpenEXR file; empty for the one whose name fits best. A layer called
             "normal" goes before those without a name, and these before any other.
@@ -121,7 +121,7 @@ def _layer_name(name: str) -> str:
 
 
 def _maps_among(channels: dict[str, np.ndarray]) -> dict[str, list[str]]:
-    """The channels that make a map, by the layer that they belong to: "layer.R" is of a layer."""
+    """The channels that make a map, by their layer: "layer.R" belongs to the layer "layer"."""
     maps = {}
     for layer in {name.rpartition(".")[0] for name in channels}:
         prefix = f"{layer}." if layer else ""
@@ -167,7 +167,7 @@ def _read_tiff(path: Path) -> Picture:
 
 
 def _inverted(data: np.ndarray, bits: int) -> np.ndarray:
-    """Values of which the smallest means white, the other way round."""
+    """The negative of values whose smallest one means white."""
     if data.dtype.kind == "b":
         return (~data).astype(np.uint8) * np.uint8(255)
     if data.dtype.kind != "u":

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 
 def above_horizon(active: mi.Bool, *directions: mi.Vector3f) -> tuple:
-    """``(active, *directions)``, of the lanes alone in which all directions are above the horizon.
+    """``(active, *directions)``: active are only lanes whose directions all lie above the horizon.
 
     Elsewhere all of them become the vertical, for which everything is a number: a NaN in a lane
     that is masked away would still reach its derivatives. The ``bumpmap`` of Mitsuba 3.9 hands over

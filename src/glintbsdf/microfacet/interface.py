@@ -44,8 +44,9 @@ class Component(ABC):
 
     @abstractmethod
     def above_horizon(self, active: mi.Bool, *directions: mi.Vector3f) -> tuple:
-        """``(active, *directions)``: the lanes whose directions are on the sides of the surface
-        that the component connects; the vertical elsewhere, see :func:`~.above_horizon`."""
+        """``(active, *directions)``: active are lanes whose directions are on the sides of the
+        surface that the component connects; elsewhere directions become the vertical, see
+        :func:`~.above_horizon`."""
 
     @abstractmethod
     def half_vector(self, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Vector3f:
@@ -55,8 +56,8 @@ class Component(ABC):
     def scattered(
         self, wi: mi.Vector3f, m: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Bool]:
-        """Where the facet ``m`` scatters ``wi`` to, and the active lanes in which it does: those
-        whose facet points up and whose new direction is on the right side of the surface."""
+        """Where the facet ``m`` scatters ``wi`` to, and the active lanes in which it does: there
+        the facet points up, and the new direction is on the right side of the surface."""
 
     @abstractmethod
     def density_of_direction(self, pdf: mi.Float, wo: mi.Vector3f, m: mi.Vector3f) -> mi.Float:

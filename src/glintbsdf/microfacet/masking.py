@@ -59,7 +59,7 @@ class SmithMasking:
         return {}
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Rebuild what depends on the parameters named, on all of them where none is."""
+        """Rebuild what depends on the parameters named; on any of them where none is named."""
 
 
 class BeckmannMasking(SmithMasking):

@@ -35,7 +35,7 @@ DISTRIBUTIONS = ("beckmann", "ggx")
 #: lobe that leans away so far are not seen (their share is below 1e-10).
 FAR = 6.0
 
-#: Newton steps, at most, of the sampler where the mean normal faces away; measured need: 9.
+#: Newton steps of the sampler, at most, where the mean normal faces away; it needs nine.
 NEWTON_STEPS = 16
 
 
@@ -79,7 +79,7 @@ class SlopeLobe:
     Args:
         mean (mi.Vector2f): mean slope b.
         uu, vv, uv (mi.Float): entries of the roughness matrix Ω, the squares of roughnesses.
-        determinant (mi.Float): |Ω| > 0, for the caller knows how to avoid cancellation.
+        determinant (mi.Float): |Ω| > 0; the caller knows how to compute it without cancellation.
         distribution (str): ``beckmann`` or ``ggx``.
     """
 
@@ -135,7 +135,7 @@ class SlopeLobe:
     def visible_area(self, w: mi.Vector3f) -> mi.Float:
         """``P(w) = ∫ max(0, w·m) D(m) dω_m``: area of the facets that face w, masking left out.
 
-        0 where practically none does, see :data:`FAR`.
+        It is 0 where practically no facet does, see :data:`FAR`.
         """
         mean, width_squared = self.mean_cosine(w), self.width_squared(w)
         if self.distribution == "ggx":
@@ -242,5 +242,5 @@ def sample_above(x, survival, active):
             advance,
             "visible slopes",
         )
-    # One more step, which carries derivatives: at the solution, those of the inverse function.
+    # One more step carries derivatives: at the solution, it has those of the inverse function.
     return x + dr.sqrt(dr.maximum(step(dr.maximum(q, 1e-12)), 1e-12))
