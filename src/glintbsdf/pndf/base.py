@@ -5,14 +5,14 @@ projected normals: ``∫ D(m) dm = 1``. One object is the density, its sampler, 
 of its facets, from which masking follows.
 
 A new method is a class that derives from :class:`PNDF`, says what the abstract methods ask for, and
-is entered in the register::
+enters the register::
 
     @register("my_method", title="My method")
     class MyMethod(PNDF):
         ...
 
-Tests, benchmarks and the report take their methods from the register. How to write one is told on
-the page "Write your own P-NDF".
+Tests, benchmarks and the report take their methods from the register. The page "Write your own
+P-NDF" tells how to write one.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class PNDF(ABC):
     defaults here. Callers use :meth:`eval`, :meth:`sample` and the methods after them.
 
     Attributes:
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
         normal_map (NormalMap): the map; None for a P-NDF without one.
-        domain (Domain): what has been built for; None for any query.
+        domain (Domain): the queries that the structure is built for; None for any query.
         intensity (mi.Float): factor on the reflection; None for 1.
-        colors: colours of the facets, an object with the ``mean`` of them as three numbers; D is
-            then an ``mi.Color3f``. None for a P-NDF without colours.
+        colors (Colors): colours of the facets; D is then an ``mi.Color3f``. None for a P-NDF
+            without colours.
     """
 
     #: Kernel of the footprint and clamp of triangles that a reference must use to agree.
@@ -80,18 +80,18 @@ class PNDF(ABC):
     # ----------------------------------------------------------------------------------------------
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make what queries within ``domain`` need, or any query; whatever there was, goes.
+        """Make what queries within ``domain`` need, or any query; what was built before goes.
 
-        Within the domain, answers are the same to the last bit as those of a complete structure. A
-        method may build for more than it is asked to, never for less. This one has no structure.
+        Within the domain, the answers are to the last bit those of a complete structure. A method
+        may build for more than it is asked to, never for less. By default there is no structure.
         """
         self.domain = domain
 
     def cached(self, build: Callable[[], Mapping[str, np.ndarray]], *parameters: object) -> dict:
         """Arrays from the cache on disk, or from ``build()``; see :func:`~.load_or_build`.
 
-        The key is the map and ``parameters``, besides the source of the builder. Of a map that has
-        been changed since it was loaded, nothing is kept.
+        The key is the map and ``parameters``, besides the source of the builder. Nothing is kept
+        for a map that has been changed since it was loaded.
         """
         if self.changed:
             return dict(build())
@@ -165,7 +165,7 @@ class PNDF(ABC):
     ) -> mi.Vector3f:
         """A unit normal for the view from ``wi``; one with z ≤ 0 is an invalid sample.
 
-        By default it is drawn from D, whatever the view.
+        By default the normal is drawn from D, whatever the view.
         """
         return normal_from_projection(self.sample(query, sample1, sample2, active))
 
@@ -210,7 +210,7 @@ class PNDF(ABC):
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
         """Masking and shadowing by one of :attr:`maskings`; None for ``none``.
 
-        ``beckmann`` is that of a Beckmann surface as rough as all normals together.
+        ``beckmann`` is the masking of a Beckmann surface as rough as all normals together.
         """
         if name == "beckmann":
             return BeckmannMasking(self.alpha_squared, height_correlated, self.roughness_keys)
@@ -233,7 +233,7 @@ class PNDF(ABC):
         """Show the parameters to ``callback``."""
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check the parameters named, all of them where none is, and rebuild what they decide."""
+        """Check the parameters named, or all where none is named; rebuild what they decide."""
 
 
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
@@ -258,10 +258,10 @@ class Method:
         name (str): its name, lower case.
         title (str): what reports call it.
         pndf (type): the class.
-        takes_map (bool): whether its first argument is a :class:`~glintbsdf.NormalMap`.
+        takes_map (bool): whether the class takes a :class:`~glintbsdf.NormalMap` first.
         plugin (str): type of the plugin that wraps it.
         options (dict): arguments, besides the map, with which tests and reports make it.
-        settings (dict): the same as parameters of the plugin.
+        settings (dict): the same options, as parameters of the plugin.
     """
 
     name: str
@@ -292,7 +292,8 @@ def register(
     """Enter a class in the register, see :class:`Method`; a decorator.
 
     Raises:
-        TypeError: it lacks a part of the contract, which is named; or another class has the name.
+        TypeError: the class lacks a part of the contract, which the message names; or another class
+            has the name.
     """
 
     def enter(pndf: P) -> P:

@@ -1,9 +1,9 @@
 """The facets of a displaced surface: a P-NDF of a height map, seen in the shading frame.
 
-A P-NDF of a height map lives in the frame of the map: its slopes are those of texels over texels.
-On a surface texels lie turned, mirrored or stretched, and so do the facets: the mathematics is in
-:mod:`glintbsdf.microfacet.slope_frame`. Here both are put together, once for every method and every
-masking.
+A P-NDF of a height map lives in the frame of the map: its slopes are texels over texels. On a
+surface texels lie turned, mirrored or stretched, and so do the facets; the mathematics is in
+:mod:`glintbsdf.microfacet.slope_frame`. This module puts both together, once for every method and
+every masking.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class Displaced(PNDF):
     """A P-NDF of a height map at one surface interaction.
 
     Args:
-        pndf: in the frame of the map.
-        frame: of the surface there.
+        pndf: the P-NDF in the frame of the map.
+        frame: the surface's frame at the interaction.
     """
 
     def __init__(self, pndf: PNDF, frame: SlopeFrame) -> None:
@@ -40,7 +40,7 @@ class Displaced(PNDF):
         of_map = self.pndf.sample_visible(
             seen_from, in_map(query, self.frame), sample1, sample2, active
         )
-        # One that is invalid stays so.
+        # An invalid sample stays invalid.
         return dr.select(of_map.z > 0, self.frame.normal_from_map(of_map), of_map)
 
     def visible_pdf(self, wi, m, density, query, active):
@@ -67,8 +67,8 @@ class DisplacedMasking(SmithMasking):
     """Masking and shadowing by the facets of a height map at one surface interaction.
 
     Args:
-        masking: in the frame of the map.
-        frame: of the surface there.
+        masking: the masking in the frame of the map.
+        frame: the surface's frame at the interaction.
     """
 
     def __init__(self, masking: SmithMasking, frame: SlopeFrame) -> None:

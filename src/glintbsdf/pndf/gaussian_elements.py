@@ -88,7 +88,7 @@ class Gaussian:
 class Overlap:
     """What a footprint sees of a lobe.
 
-    Costs of one query per lobe: with all lobes alike (S the same), make it once per footprint.
+    Where all lobes have the same S, make one per footprint: it serves them all.
 
     Args:
         footprint (Gaussian): Σ_p; zero is legal.

@@ -17,13 +17,16 @@ MIN_ALPHA = 1e-4
 
 
 def smooth_alpha(alpha_squared: mi.Vector2f, sigma_r: float | mi.Float = 0.0) -> mi.Vector2f:
-    """The roughness of a smooth surface whose facets have this squared roughness and, each, the
-    intrinsic roughness σ_r, which adds 2σ_r²; at least :data:`MIN_ALPHA`."""
+    """The roughness of a smooth surface, at least :data:`MIN_ALPHA`.
+
+    Its facets have this squared roughness together, and each has the intrinsic roughness σ_r, which
+    adds 2σ_r².
+    """
     return dr.sqrt(dr.maximum(alpha_squared + 2 * dr.square(sigma_r), MIN_ALPHA**2))
 
 
 class SmoothBeckmann(PNDF):
-    """The facets of a smooth Beckmann surface, whatever the footprint: those of ``roughconductor``.
+    """The facets of a smooth Beckmann surface, as ``roughconductor`` has them, for any footprint.
 
     Visible normals, masking and shadowing are separable, as in that plugin of Mitsuba.
 

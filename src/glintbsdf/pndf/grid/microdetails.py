@@ -3,7 +3,7 @@
 Zirr and Kaplanyan, "Real-time Rendering of Procedural Multiscale Materials" (I3D 2016). The surface
 is covered by grids whose cells grow by powers of two, and every cell holds a random, repeatable
 number of microdetails that reflect for the half vector asked for. There is no map, no structure and
-no memory: all comes from hashed integers. The functions stand in the paper's order and use its
+no memory: hashed integers make everything. The functions stand in the paper's order and use its
 symbols; where they depart from it, they say so.
 
 Slopes are ``x = m_xy / m_z`` of a unit normal m; α = √2 σ is a Beckmann roughness. Subscripts: g
@@ -192,7 +192,7 @@ def covariance(du: mi.Vector2f, dv: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi
 
 
 def larger_eigenvalue(a: mi.Float, b: mi.Float, c: mi.Float) -> mi.Float:
-    """Of the symmetric matrix ((a, b), (b, c))."""
+    """As the name says, for the symmetric matrix ((a, b), (b, c))."""
     difference = 0.5 * (a - c)
     return 0.5 * (a + c) + dr.sqrt(dr.fma(difference, difference, b * b))
 
@@ -221,13 +221,13 @@ def paraboloid_map(x: mi.Vector2f, cos_theta: mi.Float) -> mi.Vector2f:
 class ReflectingCount:
     """Draws the number of microdetails out of n that reflect, each with probability P(h).
 
-    Counts from the less likely of both outcomes, so that P → 1 is as good as P → 0. Small
-    expectations are drawn from the exact binomial distribution by inversion, its tail after
-    ``EXACT_TERMS`` from a truncated geometric distribution that goes on with the ratio of the next
-    two terms; all others from a Gaussian with the binomial's mean and variance, plus the quadratic
-    term of Cornish and Fisher that gives it the binomial's skewness as well: so the Gaussian may
-    begin at ``EXACT_MEAN``, where a symmetric one would often be negative. The mean is n P within
-    8e-4 (both errors are largest there).
+    It counts the less likely of both outcomes, so that P → 1 is as good as P → 0. Small
+    expectations come from the exact binomial distribution by inversion; its tail after
+    ``EXACT_TERMS`` terms comes from a truncated geometric distribution that goes on with the ratio
+    of the next two terms. All other expectations come from a Gaussian with the binomial's mean and
+    variance, plus the quadratic term of Cornish and Fisher, which gives it the binomial's skewness
+    as well. So the Gaussian may begin at ``EXACT_MEAN``, where a symmetric one would often be
+    negative. The mean is n P within 8e-4 (both errors are largest there).
 
     Args:
         p (mi.Float): P(h), in [0, 1].
@@ -381,7 +381,7 @@ class Grid(PNDF):
     reflecting microdetails over its expectation. Derivatives flow through the first: glints stay
     where and as many as they are, and the derivative of the mean is exact.
 
-    Belongs to the variant of Mitsuba that is active when it is made.
+    It belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
         alpha (pair of floats): α_g along u and v, ≥ 1e-4.
@@ -396,7 +396,7 @@ class Grid(PNDF):
         colors (Wheel, Palette or None): colours of the microdetails.
         max_anisotropy (float): K_a ≥ 1, the largest aspect ratio of a pixel that is resolved.
         seed (int): another one gives other microdetails, in [0, 2³²).
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
 
     Raises :class:`~.ParameterError`.
     """
@@ -480,7 +480,7 @@ class Grid(PNDF):
         return self.mean
 
     def masking(self, name: str = "beckmann", height_correlated: bool = False):
-        """That of the mean, as ``roughconductor`` has it."""
+        """The masking of the mean, as ``roughconductor`` has it."""
         return super().masking(name, height_correlated)
 
     # Samples come from the mean over all places.
@@ -553,7 +553,7 @@ class Grid(PNDF):
             count = binomial.draw(b, n, active)
             if self.colors is None:
                 return count / n
-            # What N colours drawn at random add up to is near N times their mean
+            # N colours drawn at random add up to nearly N times their mean
             mean = mi.Color3f(*self.colors.mean)
             color = self.colors.pick(uniform(c)) - mean
             return count / n * (mean + color * dr.rsqrt(dr.maximum(count, 1)))

@@ -30,8 +30,9 @@ class BlocksOfEllipses(BlocksOfQuads):
     def meets(ellipse, centre, half):
         """Whether an octagon about an ellipse meets a rectangle (separating axes).
 
-        ``centre``, ``half`` (``mi.Vector2f``) are those of the rectangle. The octagon, regular if
-        the ellipse is round, is a twentieth larger; nothing cancels however thin the ellipse.
+        ``centre``, ``half`` (``mi.Vector2f``): centre and half extents of the rectangle. The
+        octagon, regular if the ellipse is round, is a twentieth larger than the ellipse. Nothing
+        cancels, however thin the ellipse.
         """
         lower, upper = BlocksOfEllipses.extent(ellipse)
         meets = dr.all((lower <= centre + half) & (upper >= centre - half))

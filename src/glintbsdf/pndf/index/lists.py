@@ -3,8 +3,8 @@
 The plane of projected normals is cut into cells, the lattice of texels into rows of blocks. For
 every (row of blocks, cell) there is a list of the quads of the row whose normals reach into the
 cell, from left to right, with the list's subdivision by blocks. A query has one cell; every row of
-blocks under its footprint is then one run of consecutive entries, whatever the footprint's shape:
-no tree, no stack, nothing visited that is not near in both position and normal.
+blocks under its footprint is then one run of consecutive entries, whatever the footprint's shape.
+There is no tree and no stack, and a query visits only what is near in both position and normal.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SHIFT = BLOCK.bit_length() - 1  # quad to block
 #: Resolution per axis of the table that maps a normal to its cell.
 RESOLUTION = 1024
 
-#: Cells per axis that are tried, the finest that fits being taken.
+#: Cells per axis that are tried; the finest that fits is taken.
 DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
 
 #: Memory allowed, bytes per quad, the vertices not counted.
@@ -49,8 +49,8 @@ STRIP_COUNTERS = 1 << 23
 def every_quad(lattice: Lattice, kernel, add, active, zero=None):
     """Sum over all quads that the kernel's bounding box touches; see :meth:`QuadLists.visit`.
 
-    The right loop for footprints of a few texels, where searching costs more than it saves. The sum
-    begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
+    This is the loop for footprints of a few texels, where searching costs more than it saves. The
+    sum begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
     """
     mean = mi.Vector2f(kernel.mean)
     left, top = floor_int(mean.x - kernel.reach_u), floor_int(mean.y - kernel.reach_v)
@@ -85,9 +85,9 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
     column that an entry stands for, and whatever else ``add`` is to be given. The sum begins with
     ``zero``, as in :func:`every_quad`.
 
-    One loop over the runs, and one in it over a run's entries. In a flat one, which no lane leaves
-    before all are done, nearly every step is the first of a run to some of the lanes, so that all
-    wait while it is found; to wait at the end of the runs is cheaper by a third.
+    One loop goes over the runs, and one in it over a run's entries. No lane leaves a flat loop
+    before all are done: in it nearly every step is the first of a run to some of the lanes, and all
+    wait while it is found. It is cheaper to wait at the end of the runs.
     """
     columns, rows = lattice.x, lattice.y
     mean = mi.Vector2f(kernel.mean)
@@ -140,7 +140,7 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
 
 
 class Packed:
-    """An array of unsigned integers, two to a word where 16 bits are enough."""
+    """An array of unsigned integers; it packs two to a word where 16 bits are enough."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.half = values.dtype == np.uint16
@@ -161,8 +161,8 @@ class Packed:
 class NormalCells:
     """Division of a rectangle of projected normals into S×S cells.
 
-    S slabs along x, each cut into S cells along y, at places that are half uniform, half quantiles
-    of the map's normals: small cells where the normals, hence the queries, are many.
+    There are S slabs along x, each cut into S cells along y. The cuts are half uniform, half
+    quantiles of the map's normals: cells are small where normals, hence queries, are many.
     """
 
     divisions: int | mi.UInt32
@@ -239,7 +239,7 @@ class NormalCells:
 
 
 class Span(NamedTuple):
-    """Blocks along one axis: ``size`` from ``first`` on, block 0 following the last of ``all``."""
+    """Blocks along one axis: ``size`` from ``first`` on; block 0 follows the last of ``all``."""
 
     first: int
     size: int
@@ -281,14 +281,15 @@ class Window(NamedTuple):
 
 
 class QuadLists:
-    """The lists, of the arrays that :meth:`build` makes, wherever those were kept since.
+    """The lists, made of the arrays that :meth:`build` returns.
 
     ``window``: the blocks that have lists, all by default. Queries must not touch any other.
 
     Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
         ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
         ``entries``: quads as ``column << SHIFT | row in block``;
-        ``start`` (R·C): first entry of a list; ``offset`` (R·C·(B + 1)): from there, of each block.
+        ``start`` (R·C): first entry of each list; ``offset`` (R·C·(B + 1)): first entry of each
+        block, counted from the list's first.
     """
 
     def __init__(
@@ -298,7 +299,7 @@ class QuadLists:
         self.cells = NormalCells(
             arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
         )
-        # Taken out one by one: of a large map, no more than one need exist twice.
+        # Taken out one by one, so that a large map never has more than one array twice.
         self.entries, self.offset = Packed(arrays.pop("entries")), Packed(arrays.pop("offset"))
         self.start = mi.UInt32(arrays.pop("start"))
         self.nbytes = self.entries.nbytes + self.offset.nbytes + 4 * dr.width(self.start)
@@ -348,9 +349,8 @@ class QuadLists:
         """Build the arrays, in two passes over the lattice, or a window of it: count, then fill.
 
         ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
-        and two edges (``mi.Vector2f``); ``normals`` (N, 2) those of the map, ``bounds`` their
-        rectangle (lower, upper), inside which all triangles lie; ``bytes_per_quad`` the memory
-        allowed.
+        and two edges (``mi.Vector2f``); ``normals`` (N, 2) are the map's; ``bounds`` (lower, upper)
+        is a rectangle inside which all triangles lie; ``bytes_per_quad`` is the memory allowed.
         """
         window = window or Window.whole(lattice)
         blocks = BlocksOfQuads(lattice, triangles, window)
@@ -363,10 +363,10 @@ class Blocks:
     A shape is three ``mi.Vector2f``; here it is a triangle, a vertex and two edges.
 
     Attributes:
-        rows, columns (int): blocks.
+        rows, columns (int): number of blocks along each axis.
         mean_count (float): things in a block, on average.
-        largest_entry (int): bounds the entries.
-        shapes_each (int): shapes of a thing.
+        largest_entry (int): the largest entry that the lists may hold.
+        shapes_each (int): number of shapes of a thing.
     """
 
     shapes_each = 2
@@ -423,7 +423,7 @@ class BlocksOfQuads(Blocks):
 
 
 class Builder:
-    """Scan of all quads against all cells they reach, one lane per block of quads.
+    """Scans all quads against all cells that they reach, one lane per block of quads.
 
     A lane alone touches the counters of its block, so the order of the entries, and with it every
     later sum, is the same on all machines.

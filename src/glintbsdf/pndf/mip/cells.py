@@ -1,6 +1,6 @@
 """The grids of a synthesised map that a footprint touches, level by level, and their lobes.
 
-The levels and their arrays are those of :mod:`glintbsdf.pndf.mip.levels`. A level's grids divide
+:mod:`glintbsdf.pndf.mip.levels` makes the levels and their arrays. A level's grids divide
 the map along each axis by the same borders, so a grid is a pair of indices. Level 0 has one texel
 per grid; then come the divisions of cells, the cells, and groups of cells.
 """
@@ -19,7 +19,7 @@ from glintbsdf.pndf.mip.levels import Layout, morton
 
 
 class CellAxis:
-    """LevelCells along either axis of the map, which goes on for ever: repeated, or mirrored.
+    """The grids along either axis of the map, which goes on for ever, repeated or mirrored.
 
     Beyond the map, grids are counted on; :meth:`at` says which stored grid one looks like.
 
@@ -102,7 +102,7 @@ class CellsAlongAxis:
         return mi.Int(dr.select(self.texels, index, start))
 
     def placed(self, x: mi.Float | mi.Int, turn: mi.Int, flipped: mi.Bool) -> mi.Float | mi.Int:
-        """The position of a stored one in a copy of the map."""
+        """The position in a copy of the map that a stored position has there."""
         x = dr.select(flipped, self.axis.size - x, x)
         return x + type(x)(turn * self.axis.size)
 
@@ -162,9 +162,9 @@ class LevelCells:
     def run(self, level, axis: CellsAlongAxis, y, x, flipped, active):
         """The lobes of the stored grid (``y``, ``x``): ``(first, count, first_2, count_2)``.
 
-        The second run, of those in the cell's overlaps, is empty but for divisions of cells. For
-        texels, the run goes on over those that follow in x, as far as their lobes do, unless the
-        map is ``flipped`` in x.
+        The second run has the lobes in the cell's overlaps; it is empty but for divisions of cells.
+        For texels, the run goes on over the texels that follow in x, as far as their lobes do,
+        unless the map is ``flipped`` in x.
         """
         first_of_level = dr.gather(mi.UInt32, self.first, level, active)
         texels, cells = level == 0, level > self.divisions

@@ -12,8 +12,8 @@ one lobe with the mass, mean and covariance of its members.
   its own, in the order of the grids in which they lie.
 * *Cells*: k lobes for each cell of the map, for each 2×2 cells, and so on to one grid for all.
 
-So a cut is exact on all levels, and a footprint across patches needs no special treatment: the
-paper splits it into four, and falls back to unclustered lobes.
+So a cut is exact on all levels, and a footprint across patches needs no special treatment. (The
+paper splits it into four, and falls back to unclustered lobes.)
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from glintbsdf.maps.quilting import Synthesis, mesh_lobes
 from glintbsdf.pndf.gaussian_elements import SIGMA_H
 from glintbsdf.pndf.mip import packing as packed_lobes
 
-#: Smallest grid, texels: clusters of grids much smaller would hold one or two texels each.
+#: Smallest grid, texels. In much smaller grids, clusters would hold one or two texels each.
 SMALLEST_GRID = 12
 
 #: Iterations of k-means.
@@ -51,13 +51,13 @@ class Lobes:
         return Lobes(self.mass[index], self.mean[index], self.covariance[index])
 
     def moved(self, offset: np.ndarray) -> Lobes:
-        """The lobes, ``offset`` (N×2 or 2, texels) further on."""
+        """The lobes, moved by ``offset`` (N×2 or 2, texels)."""
         mean = self.mean.copy()
         mean[:, :2] += offset
         return Lobes(self.mass, mean, self.covariance)
 
     def packed(self, extent: float) -> np.ndarray:
-        """As :func:`~.pack` packs them."""
+        """The lobes as :func:`~.pack` packs them."""
         return packed_lobes.pack(self.mass, self.mean, self.covariance, extent)
 
     @staticmethod
@@ -73,9 +73,9 @@ class Lobes:
 def texel_lobes(normals: np.ndarray) -> Lobes:
     """The lobes of a map (Eq. 4, 5), one per texel, from the texel's corner: H·W lobes.
 
-    S = σ_h² I, the cross-covariance J S, and J S Jᵀ for the normals; the intrinsic roughness σ_r is
-    left to evaluation. Lobes stand where :func:`~.mesh_lobes` puts them, half a
-    texel beyond the texel's centre, at (1, 1).
+    The covariance is S = σ_h² I for positions, J S between normals and positions, and J S Jᵀ for
+    normals; evaluation adds the intrinsic roughness σ_r. Lobes stand where :func:`~.mesh_lobes`
+    puts them, half a texel beyond the texel's centre, at (1, 1).
     """
     mean, jacobian = (v.reshape(-1, *v.shape[2:]) for v in mesh_lobes(normals.astype(np.float64)))
     count = len(mean)
@@ -87,8 +87,8 @@ def texel_lobes(normals: np.ndarray) -> Lobes:
 def merged(lobes: Lobes, label: np.ndarray, count: int) -> Lobes:
     """One lobe for each of ``count`` labels, with the mass, mean and covariance of its members.
 
-    Exact moments: the covariance is the mean of the members' plus that of their means. A label
-    without members gives a lobe of no mass.
+    The moments are exact: the covariance is the mean of the members' covariances plus the
+    covariance of their means. A label without members gives a lobe of no mass.
     """
 
     def total(values: np.ndarray) -> np.ndarray:
@@ -122,8 +122,8 @@ class Clustering:
     def gather(self, lobes: Lobes, group: np.ndarray, groups: int, side: float) -> Lobes:
         """Gather the lobes of every group to ``clusters`` ones, stored group after group.
 
-        ``group``: of every lobe, ascending. Groups with fewer lobes are filled up with lobes of no
-        mass.
+        ``group``: the group of every lobe, ascending. Groups with fewer lobes are filled up with
+        lobes of no mass.
         """
         k = self.clusters
         scale = np.array([np.sqrt(12) / side] * 2 + [self.normal_scale] * 2)
@@ -141,7 +141,7 @@ class Clustering:
         if count <= self.clusters:
             return np.arange(count)
         begin = features[self.rng.choice(count, self.clusters, replace=False)]
-        from scipy.cluster.vq import kmeans2  # half a second that only those pay who build
+        from scipy.cluster.vq import kmeans2  # half a second, which only building costs
 
         return kmeans2(features, begin, iter=ITERATIONS, minit="matrix")[1]
 
@@ -149,7 +149,8 @@ class Clustering:
 def morton(y, x, n: int):
     """Index of a grid among n×n ones, n a power of two, in Morton order.
 
-    Those of a coarser division lie side by side. NumPy's or Dr.Jit's integers.
+    The grids that make up one of a coarser division lie side by side. Takes integers of NumPy or
+    Dr.Jit.
     """
     result = 0
     for bit in range(n.bit_length() - 1):
@@ -162,9 +163,9 @@ class Layout:
     """How cells are divided and levels follow each other.
 
     Attributes:
-        divisions: n of the levels inside patches, finest first; a power of two each.
-        inner: side of the smallest cell, texels: grids are ``inner / n`` wide, the last one of a
-            larger cell more.
+        divisions: n of each level inside patches, finest first; each is a power of two.
+        inner: side of the smallest cell, texels. Grids are ``inner / n`` wide; the last grid of a
+            larger cell is wider.
         cells: number of grids along an axis of the levels from one cell per grid on.
     """
 
@@ -184,7 +185,7 @@ class Layout:
         return cls(tuple(divisions), inner, tuple(cells))
 
     def grid(self, position: np.ndarray, n: int) -> np.ndarray:
-        """Grid along an axis that holds a position in a cell, of ``n``."""
+        """Which of the ``n`` grids of a cell, along an axis, holds a position."""
         return np.clip((position * (n / self.inner)).astype(np.int64), 0, n - 1)
 
 
@@ -194,11 +195,11 @@ def build(
     """All levels of lobes of a synthesised map.
 
     Returns:
-        ``texels``: packed lobes of the sample's texels; ``inside``: those inside patches, patch by
-        patch, division by division, row by row of the grids; ``overlaps``: those of the cells'
-        overlaps; ``segments``, (n² + 1) per cell: where in them each grid of the finest division
-        begins, in Morton order; ``cells``: those of cells and groups of cells, level by level;
-        ``normals``, per level: the rectangle (lower, upper) of the lobes' normals, to
+        ``texels``: packed lobes of the sample's texels; ``inside``: lobes inside patches, patch by
+        patch, division by division, row by row of the grids; ``overlaps``: lobes of the cells'
+        overlaps; ``segments``, (n² + 1) per cell: where in the overlaps each grid of the finest
+        division begins, in Morton order; ``cells``: lobes of cells and groups of cells, level by
+        level; ``normals``, per level: the rectangle (lower, upper) of the lobes' normals, to
         :data:`~.NORMAL_CUT` standard deviations.
         Unless there are divisions, ``inside``, ``overlaps`` and ``segments`` are empty.
     """
@@ -248,8 +249,8 @@ def all_words(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _inside_patches(synthesis, layout, clustering, texels) -> tuple[Lobes, Lobes | None]:
-    """Lobes inside patches, positions from the patch's corner, and those of the coarsest division
-    (None where there is no division)."""
+    """Lobes inside patches, with positions from the patch's corner, and the lobes of the coarsest
+    division (None where there is no division)."""
     patches = len(synthesis.origins)
     levels, members = [], None
     for n in layout.divisions:
@@ -321,7 +322,7 @@ def _cells(synthesis, layout, clustering, texels, finest):
 
 
 def _cell_row(synthesis, layout, texels, row: int, whole: bool) -> tuple[Lobes, np.ndarray]:
-    """Lobes of the texels of a row of cells, whole or those of overlaps only, and their cells."""
+    """Lobes of the texels of a row of cells, all or in overlaps only, and their cells."""
     rows = np.arange(synthesis.starts[row], synthesis.starts[row + 1])
     y, x = (v.ravel() for v in np.meshgrid(rows, np.arange(synthesis.size), indexing="ij"))
     cell = synthesis.cell_of[x]

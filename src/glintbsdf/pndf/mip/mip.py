@@ -2,12 +2,12 @@
 
 Tan, Zhu, Xu, Meng, Wang and Yan, "Real-Time Microstructure Rendering with MIP-mapped Normal Map
 Samples" (2022), section 5.2. The map is made from a small sample
-(:mod:`glintbsdf.maps.quilting`); its lobes are those of the sample, gathered to few per grid on
+(:mod:`glintbsdf.maps.quilting`); it takes its lobes from the sample, gathered to few per grid on
 each MIP level (:mod:`glintbsdf.pndf.mip.levels`).
 
-Of a level, all lobes of the grids that the footprint reaches count, each by the closed form of
-:mod:`glintbsdf.pndf.gaussian_elements`; their sum is divided by the sum of their masses, so that D
-integrates to one whatever the footprint. With λ between two levels, both are blended; in the
+On a level, all lobes of the grids that the footprint reaches count, each by the closed form of
+:mod:`glintbsdf.pndf.gaussian_elements`. Their sum is divided by the sum of their masses, so that D
+integrates to one whatever the footprint. Where λ lies between two levels, both are blended; in the
 paper's Eq. 9 the weights have changed places.
 """
 
@@ -63,8 +63,8 @@ GRID_CUT = 12.25
 class Mip(PNDF):
     """P-NDF of a large map synthesised from a sample (Tan et al. 2022).
 
-    Belongs to the variant of Mitsuba that is active when it is made. The unit square of UV is the
-    large map. Its ``wrap_mode`` is the sample's: to ``repeat``, its edges are made to fit;
+    It belongs to the variant of Mitsuba that is active when it is made. The unit square of UV is
+    the large map. Its ``wrap_mode`` is the sample's: to ``repeat``, its edges are made to fit;
     ``mirror`` mirrors it; ``clamp`` does so too, and holds the footprint's centre inside.
 
     Args:
@@ -74,11 +74,11 @@ class Mip(PNDF):
         clusters (int): k, lobes per grid of each level, from 1 to 1024.
         lod_scale (float): C_P ≥ 0 of Eq. 8, λ = C_P log₂ P with P the footprint's area in texels,
             (2σ)² for a round one. With 1/2, a level's grids are as wide as the footprint.
-        sigma_r (float): intrinsic roughness, the standard deviation of normals about those of the
-            map, in [1e-8, 1].
+        sigma_r (float): intrinsic roughness, the standard deviation of normals about the map's, in
+            [1e-8, 1].
         normal_weight (float): weight ≥ 0 of normals against positions where lobes are clustered;
             see :class:`~.Clustering`.
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
 
     Attributes:
         data (mi.TensorXf): projected normals of the sample, h×w×2. After a change of its values,
@@ -199,8 +199,8 @@ class Mip(PNDF):
 
         ``offset`` (texels) is the footprint's centre as seen from the origin of the lobe's
         positions, in the frame of the lobe's copy of the map, whose axes a mirrored map flips:
-        ``sign``. One flat loop, ``lobes_per_turn`` of them a turn. What is not summed is whole
-        numbers: Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
+        ``sign``. One flat loop takes ``lobes_per_turn`` lobes a turn. State that is no sum is in
+        whole numbers: Dr.Jit (1.5) cannot take forward derivatives past floats from a branch.
         """
         grids, mirrored = self.grids, self.wrap_mode != "repeat"
         with dr.suspend_grad():
@@ -347,8 +347,8 @@ class Mip(PNDF):
         return cut_of_lists(dr.sqrt(kernel.minor_variance + SIGMA_H**2))
 
     def mass_is_summed(self, level: mi.UInt32) -> mi.Bool:
-        """Whether the mass of all lobes is to be summed. Those of texels are a lattice, whose mass
-        is known, but where a mirrored map has two at its edge, or none."""
+        """Whether the mass of all lobes is to be summed. Lobes of texels are a lattice, whose mass
+        is known, except where a mirrored map has two at its edge, or none."""
         return (level > 0) | (self.wrap_mode != "repeat")
 
     def mass_of_texels(self, kernel: TexelKernel) -> mi.Float:
@@ -452,8 +452,8 @@ class Mip(PNDF):
 
 
 def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
-    """``added(*sums)`` in the lanes that need it, in a branch; with derivatives, in all, as
-    :func:`~.add_where` does."""
+    """``added(*sums)``: in a branch, for the lanes that need it; with derivatives, for all lanes,
+    as :func:`~.add_where` does."""
     if dr.grad_enabled(added(*sums)):
         return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
     return dr.if_stmt(sums, needed, added, lambda *sums: sums)

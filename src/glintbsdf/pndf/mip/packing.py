@@ -4,8 +4,8 @@ A lobe is a Gaussian in (x, y, n_x, n_y). Its covariance is kept as the factors
 
     S = L Lᵀ        cross-covariance B Lᵀ        normals B Bᵀ + Q Qᵀ
 
-of the positions' covariance S and of those of the normals: B says how they change over the lobe,
-its Jacobian being B L⁻¹, and Q how much they vary in one place. With the footprint's centre d and
+of the positions' covariance S and the normals' covariance. B says how normals change over the lobe,
+whose Jacobian is B L⁻¹; Q says how much they vary in one place. With the footprint's centre d and
 covariance Σ = V Vᵀ seen from the lobe's mean and scaled by L⁻¹, so that S becomes the unit matrix,
 
     T = I + Σ      |T| = 1 + tr Σ + |Σ|      T⁻¹ = (I + adj Σ) / |T|      Σ T⁻¹ = (Σ + |Σ| I) / |T|
@@ -27,9 +27,9 @@ from glintbsdf.pndf.elements.elements import FADE
 from glintbsdf.pndf.gaussian_elements import Gaussian
 from glintbsdf.pndf.manifold.mesh import cross
 
-#: Standard deviations of a lobe's normals beyond which they are left out: 1.5e-4 of the mass at
-#: most, be it that all lobes spread normals alike in both directions, or that a footprint sees each
-#: at its rim, where its mean is as far off as the footprint is.
+#: Standard deviations of a lobe's normals beyond which they are left out. This loses 1.5e-4 of the
+#: mass at most, whether all lobes spread normals alike in both directions, or a footprint sees each
+#: lobe at its rim, where its mean is as far off as the footprint is.
 NORMAL_CUT = 4.2
 
 
@@ -64,7 +64,7 @@ def pack(mass: np.ndarray, mean: np.ndarray, covariance: np.ndarray, extent: flo
     ====  =============================================================
 
     Args:
-        mass: N, of which 0 stands for no lobe.
+        mass: N; a mass of 0 stands for no lobe.
         mean, covariance: N×4 and N×4×4, in texels and units of projected normals.
         extent: largest coordinate of a position, texels.
     """
@@ -94,7 +94,7 @@ def pack(mass: np.ndarray, mean: np.ndarray, covariance: np.ndarray, extent: flo
 
 
 class Lobe:
-    """One packed lobe per lane: where its normals are, which most queries need not know more of.
+    """One packed lobe per lane: where its normals are. Most queries need not know more of it.
 
     Args:
         words (mi.UInt32): all packed lobes, flat.
@@ -113,7 +113,7 @@ class Lobe:
         self.spread = halves(self.packed.w)[0]
 
     def may_show(self, m: mi.Vector2f, variance: mi.Float) -> mi.Bool:
-        """Whether ``m`` is near its normals; ``variance``: σ_r²."""
+        """Whether ``m`` is near the lobe's normals; ``variance``: σ_r²."""
         reach = NORMAL_CUT**2 * dr.fma(self.spread, self.spread, variance)
         return dr.squared_norm(m - self.mean_normal) < reach
 
@@ -121,10 +121,11 @@ class Lobe:
         """The lobe under a footprint.
 
         Args:
-            offset (mi.Vector2f): its centre from the origin of the lobe's positions, texels.
-            extent (mi.Float): that of :func:`pack`.
-            vectors: two ``mi.Vector2f``, whose outer products make up its covariance.
-            cross_squared (mi.Float): the determinant of that.
+            offset (mi.Vector2f): the footprint's centre, from the origin of the lobe's positions,
+                texels.
+            extent (mi.Float): ``extent`` of :func:`pack`.
+            vectors: two ``mi.Vector2f``, whose outer products make up the footprint's covariance.
+            cross_squared (mi.Float): the determinant of that covariance.
         """
         return SeenLobe(self, offset, extent, vectors, cross_squared)
 
@@ -190,9 +191,9 @@ class SeenNormals:
     """A Gaussian of normals with the covariance U Uᵀ + Q Qᵀ + σ_r² I.
 
     Args:
-        mean (mi.Vector2f): its mean.
-        vectors: the two columns of U, ``mi.Vector2f``: what normals vary over the footprint.
-        rest: Q_xx, Q_yx, Q_yy: what they vary in one place.
+        mean (mi.Vector2f): mean of the normals.
+        vectors: the two columns of U, ``mi.Vector2f``: how much normals vary over the footprint.
+        rest: Q_xx, Q_yx, Q_yy: how much they vary in one place.
     """
 
     def __init__(self, mean: mi.Vector2f, vectors: tuple, rest: tuple) -> None:
@@ -228,7 +229,7 @@ class SeenNormals:
 
 
 def scaled_distance(vectors: tuple, d: mi.Vector2f, root: mi.Float) -> mi.Float:
-    """dᵀ (I + V Vᵀ)⁻¹ d for the columns V, ``root`` being the determinant to the power −1/2."""
+    """dᵀ (I + V Vᵀ)⁻¹ d for the columns V; ``root`` is the determinant to the power −1/2."""
     distance = dr.squared_norm(d)
     for v in vectors:
         distance = dr.fma(cross(v, d), cross(v, d), distance)
