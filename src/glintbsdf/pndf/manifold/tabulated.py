@@ -163,7 +163,10 @@ class TabulatedManifold(Manifold):
     def counts_of(self, level):
         """Number of the nodes (``mi.Int``) of a level along y and x."""
         index = mi.UInt32(dr.maximum(level, 0))
-        return [dr.gather(mi.Int, n, index) for n in (self.tables.count_y, self.tables.count_x)]
+        return [
+            dr.gather(mi.Int, n, index)
+            for n in (self.known_tables.count_y, self.known_tables.count_x)
+        ]
 
     def relative_error(self, query) -> mi.Float:
         """The relative L1 error predicted for the level that a query uses; 0 where it is exact."""
