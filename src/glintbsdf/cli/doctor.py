@@ -26,7 +26,7 @@ _PACKAGES = (
     "filelock",
 )
 
-#: Packages that only some need, and what for.
+#: Packages that only some users need, and what for.
 _OPTIONAL = {"mitsuba-oidn": "render --denoise", "distributed": "--workers and --scheduler"}
 
 # One kernel per variant, in a process of its own: a backend that does not work may abort it.
@@ -71,7 +71,7 @@ def examine() -> list[Finding]:
 
 
 def _package(name: str, use: str = "") -> Finding:
-    """``use``: what alone needs the package; without it everything does."""
+    """Whether a package is there. ``use``: what needs it; empty where everything does."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:

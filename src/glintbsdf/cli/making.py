@@ -1,5 +1,7 @@
-"""How an image is made: where, for how long, and what is kept meanwhile. Options and their work,
-for all commands that render."""
+"""How an image is made: where, for how long, and what is kept meanwhile.
+
+These are the options of all commands that render, and the work that they ask for.
+"""
 
 from __future__ import annotations
 

@@ -66,8 +66,8 @@ THREADS = "GLINTBSDF_THREADS"
 #: How often a unit that needs too much memory is halved.
 HALVINGS = 2
 
-#: How often a unit is given to workers again that have died of it, and not for want of memory as
-#: far as Dask knows. Dask itself does so once or more each time.
+#: How often a unit that workers have died of is given out again, where Dask does not know that they
+#: lacked memory. Dask itself does so once or more each time.
 TRIALS = 2
 
 
@@ -101,7 +101,7 @@ class Answer:
     Attributes:
         worker (str): its address.
         missing (tuple[Content, ...]): files that it must be sent first.
-        tile, sums: of the unit, where nothing was missing; see :func:`.sums_of_samples`.
+        tile, sums: what :func:`.sums_of_samples` returns for the unit, where nothing was missing.
         trimmed_too_far (bool): structures had to be built in full.
     """
 
@@ -120,7 +120,7 @@ class Answer:
 
 
 class _Call:
-    """What calls a function where it is unpickled."""
+    """An object that calls a function where it is unpickled."""
 
     def __init__(self, function: Callable, *arguments: object) -> None:
         self.call = function, arguments
@@ -130,7 +130,7 @@ class _Call:
 
 
 def packed(job: Job, unit: Unit) -> bytes:
-    """A task for Dask: ``pickle.loads`` of this is :func:`work`.
+    """A task for Dask: unpickling it runs :func:`work`.
 
     A worker without this package, or with another version, can receive it and fail with a sentence.
     A task that it cannot read would end it, again and again.
@@ -146,8 +146,8 @@ def work(expected: dict[str, str], task: bytes) -> Answer:
         task: the pickled job and unit.
 
     Raises:
-        ClusterError: it has others, or lacks what the variant needs.
-        MemoryError: it has not enough memory.
+        ClusterError: the worker has other versions, or lacks what the variant needs.
+        MemoryError: the worker has not enough memory.
     """
     from distributed import get_worker
 
@@ -209,8 +209,8 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
 
 @contextlib.contextmanager
 def _spare_thread(threads: int) -> Iterator[None]:
-    """In the block Dr.Jit has two threads at least, which Mitsuba needs to read OpenEXR files;
-    after it as many as are given."""
+    """Give Dr.Jit two threads at least in the block, which Mitsuba needs to read OpenEXR files;
+    after the block, as many as are given."""
     dr.set_thread_count(max(2, threads))
     try:
         yield
@@ -270,10 +270,10 @@ class Cluster:
 
         Args:
             workers: number of processes.
-            memory_limit: of each process, such as ``4GB``; a process beyond it is ended. ``auto``:
-                its part of the machine's memory.
-            variant: of Mitsuba; on GPUs each worker gets one.
-            tell: what happens meanwhile.
+            memory_limit: memory that each process may take, such as ``4GB``; a process beyond it
+                is ended. ``auto``: its part of the machine's memory.
+            variant: variant of Mitsuba; on GPUs each worker gets one GPU.
+            tell: is called with what happens meanwhile, in words.
         """
 
         def open_client(stack: ExitStack) -> Client:
@@ -327,11 +327,11 @@ class Cluster:
         Args:
             address: such as ``tcp://host:8786``, or ``tls://host:8786``; the scheme may be left
                 out.
-            keys: for TLS.
-            tell: what happens meanwhile.
+            keys: files for TLS.
+            tell: is called with what happens meanwhile, in words.
 
         Raises:
-            ClusterError: on entering: no scheduler answers, or its workers are of another version.
+            ClusterError: on entering, if no scheduler answers, or its workers have another version.
         """
         scheme, separator, rest = address.rpartition("://")
         scheme = scheme if separator else ("tls" if keys else "tcp")
@@ -382,7 +382,7 @@ class Cluster:
         self._stack.close()
 
     def _check_versions(self) -> None:
-        """Raise unless all workers that are there have this package, and in these versions."""
+        """Raise unless all workers that are there have this package, in these versions."""
         import importlib.metadata
 
         # Without this package a worker could not even read a question that is part of it.
@@ -410,8 +410,8 @@ class Cluster:
         """What renders the units of a job, for :func:`~glintbsdf.scene.rendering.produce`.
 
         Raises:
-            ClusterError: of its iterator: the scheduler is gone, a worker is of another version, or
-                none has the memory that a unit needs.
+            ClusterError: raised by its iterator, if the scheduler is gone, a worker has another
+                version, or no worker has the memory that a unit needs.
         """
         return lambda units: _Rendering(self, job).results(units)
 
@@ -433,7 +433,7 @@ _LOCAL_SETTINGS = {
 
 @dataclass(frozen=True)
 class _Errand:
-    """A unit, or a part of one that was halved, that is under way."""
+    """A unit that is under way, or a part of one that was halved."""
 
     unit: Unit
     place: tuple[int, ...]  # 0 or 1 for each time that it was halved
@@ -479,7 +479,7 @@ class _Rendering:
                 self.client.cancel(list(self.flying), force=True)
 
     def landed(self) -> list[Future]:
-        """Futures that have come to an end; none where a second passes without."""
+        """Futures that have come to an end; none where a second passes without any."""
         from distributed import wait
 
         with _connected():
@@ -607,7 +607,7 @@ class _Rendering:
 
 @contextlib.contextmanager
 def _connected() -> Iterator[None]:
-    """Raise ClusterError where the connection to the scheduler is lost in the block."""
+    """Raise ClusterError if the connection to the scheduler is lost in the block."""
     from distributed import CancelledError
     from distributed.comm import CommClosedError
 

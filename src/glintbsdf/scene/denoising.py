@@ -22,8 +22,8 @@ NAME, ALBEDO, NORMAL = "glints", "albedo", "normal"
 
 @contextmanager
 def guided(integrator: mi.Integrator) -> Iterator[mi.Integrator]:
-    """In the block, an integrator that renders as ``integrator`` does, with direct and indirect
-    light apart and the guides along with them.
+    """Yield an integrator that renders as ``integrator`` does, but keeps direct and indirect light
+    apart and renders the guides along with them.
 
     Raises:
         ValueError: ``integrator`` is not a ``glint_path``.
@@ -50,8 +50,8 @@ def guided(integrator: mi.Integrator) -> Iterator[mi.Integrator]:
 def denoised(bitmap: mi.Bitmap) -> mi.Bitmap:
     """The image that the integrator of :func:`guided` has rendered, its indirect light denoised.
 
-    Red, green and blue are those of the direct light, unchanged, plus the denoised indirect light;
-    there is an alpha channel if ``bitmap`` has one.
+    Red, green and blue are the direct light, unchanged, plus the denoised indirect light. There is
+    an alpha channel if ``bitmap`` has one.
     """
     layers = {name: np.array(layer, np.float32) for name, layer in bitmap.split()}
     direct, indirect = (layers[f"{NAME}.{part}"] for part in ("direct", "indirect"))

@@ -11,7 +11,7 @@ import numpy as np
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.units import Plan
 
-#: Passes from which the noise of an image is told.
+#: From so many passes on, the noise of an image is known.
 FEWEST_PASSES = 4
 
 
@@ -37,7 +37,7 @@ class Image:
 
         Args:
             tile: pixels that its samples reach.
-            sums: (height, width, channels) of these.
+            sums: sums of these pixels, (height, width, channels).
         """
         film = self.plan.film
         if self.sums is None or self.odd is None:
@@ -77,8 +77,8 @@ class Image:
         if any((weight <= 0).any() for weight in weights):
             return None
         a, b = (half[..., :3] / weight for half, weight in zip((even, odd), weights, strict=True))
-        # Of the same samples, halves of N₁ and N₂ have the variance σ²/N₁ + σ²/N₂ in their
-        # difference, and σ²/(N₁ + N₂) in their mean.
+        # Halves of N₁ and N₂ samples of variance σ² differ with the variance σ²/N₁ + σ²/N₂; their
+        # mean has the variance σ²/(N₁ + N₂).
         n1, n2 = (float(weight.mean()) for weight in weights)
         mean = abs(float(((n1 * a + n2 * b) / (n1 + n2)).mean()))
         difference = float(np.sqrt(np.mean(np.square(a - b))))

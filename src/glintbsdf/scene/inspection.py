@@ -3,9 +3,9 @@
 A survey renders the scene with few samples and notes the part of each map and the footprints that
 its BSDF is asked for, along whole paths, by the scene's own sensor and integrator. The BSDFs are
 then built for these, and a margin (``domain.py``). Within them a trimmed BSDF answers as a complete
-one, to the last bit; that nothing else has been asked for is checked after every pass of the
-rendering. If something has, all is built in full, and the pass is rendered again: the image is the
-same in any case.
+one, to the last bit. Every pass of the rendering checks that nothing else has been asked for. If
+something has, all is built in full, and the pass is rendered again: the image is the same in any
+case.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from glintbsdf.footprint.domain import NOTHING, Domain, Gate, Recorder
 from glintbsdf.maps.normalmap import MapShape
 from glintbsdf.scene import passes, rendering
 
-#: Paths of a survey, about: a second's work of two CPU cores.
+#: Paths that a survey follows, about.
 PATHS = 1 << 18
 
 SEED = 0x5EED
@@ -51,9 +51,10 @@ def survey(inspected: Inspected, spp: int | None = None, which: str = "") -> lis
     """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel, by
     the sensor ``which``, see :func:`~.chosen_sensor`.
 
-    None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect as
-    smooth surfaces meanwhile: later bounces of the paths go where theirs may go, if not as often.
-    Mitsuba's ``path`` asks a BSDF where a path ends as well, for nothing: that counts.
+    It is None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect
+    as smooth surfaces meanwhile: the paths' later bounces go where those of the rendering may go,
+    if not as often. Mitsuba's ``path`` asks a BSDF where a path ends as well, for nothing: that
+    counts.
 
     Raises:
         ValueError: see :func:`~.render`.
@@ -91,12 +92,13 @@ def build(inspected: Inspected) -> None:
 
 
 def build_trimmed(inspected: Inspected, domains: list[Domain | None]) -> None:
-    """Build all BSDFs for their domains and a margin; without a domain, not at all. Those without a
-    map are built in full.
+    """Build all BSDFs for their domains and a margin.
+
+    A BSDF with a map and no domain is not built at all; one without a map is built in full.
 
     Args:
-        inspected: from :func:`load`, nothing built yet.
-        domains: from :func:`survey`.
+        inspected: what :func:`load` returns; nothing is built yet.
+        domains: what :func:`survey` returns.
     """
     for bsdf, domain in zip(inspected.bsdfs, domains, strict=True):
         if bsdf.map_shape is None:
@@ -108,18 +110,18 @@ def build_trimmed(inspected: Inspected, domains: list[Domain | None]) -> None:
 
 
 class Trimmed:
-    """Glint BSDFs that hold no more than the scene asks for, and all as soon as that is too little.
+    """Glint BSDFs that hold no more than the scene asks for, until that turns out to be too little.
 
     Its :meth:`missed` is for :class:`~glintbsdf.scene.rendering.Renderer`: what trimmed BSDFs have
     answered within their domain stays, as it is the same to the last bit.
 
     Args:
-        inspected: from :func:`load`.
+        inspected: what :func:`load` returns.
         spp: samples per pixel of the rendering, None for the scene's.
         which: the sensor, see :func:`~.chosen_sensor`.
 
     Attributes:
-        sufficed (bool): nothing else has been asked for so far.
+        sufficed (bool): whether nothing else has been asked for so far.
     """
 
     def __init__(self, inspected: Inspected, spp: int | None = None, which: str = "") -> None:
@@ -149,10 +151,10 @@ class Finding:
 
     Attributes:
         plugin, name (str): its type and its id.
-        shape (MapShape): of its map, None for one without a map.
-        domain (Domain): what it is asked for, None for nothing, or where there is no map.
-        complete, trimmed (dict[str, int]): memory of each part, bytes; the same where nothing can
-            be trimmed.
+        shape (MapShape): shape of its map; None where there is no map.
+        domain (Domain): what it is asked for; None for nothing, or where there is no map.
+        complete, trimmed (dict[str, int]): memory of each part, bytes. Both are the same where
+            nothing can be trimmed.
         left_out (list[str]): what its parameters leave out of what is built and evaluated.
     """
 
@@ -222,7 +224,7 @@ def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> li
     """What each BSDF is asked for and builds, and what of that ``render --trim`` would build.
 
     Args:
-        inspected: from :func:`load`.
+        inspected: what :func:`load` returns.
         spp: samples per pixel of the rendering, None for the scene's: footprints depend on it.
         which: the sensor, see :func:`~.chosen_sensor`.
     """

@@ -36,12 +36,12 @@ def merge(
     """Render the units of a plan and add them to ``image``, which holds what is in at any time.
 
     Args:
-        image: empty.
+        image: an empty image.
         render: yields the units that it gets, in any order, with their tiles and sums.
         checkpoint: keeps what is done, and gives what it has.
-        until_noise: ends where :attr:`Image.noise` after a pass is no more than that. The image
-            does not depend on the units that are under way then.
-        time_limit: ends after so many seconds.
+        until_noise: the work ends after a pass whose :attr:`Image.noise` is no more than that. The
+            image does not depend on the units that are under way then.
+        time_limit: the work ends after so many seconds.
         observe: called whenever something has been added.
     """
     plan = image.plan
@@ -58,7 +58,7 @@ def merge(
             return noise is not None and noise <= until_noise
 
         def advance() -> bool:
-            """Add what is there and next; whether that is enough."""
+            """Add what is there and comes next; return whether that is enough."""
             added = False
             while image.count < len(plan) and not satisfied():
                 found = waiting.take(image.count)

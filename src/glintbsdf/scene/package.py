@@ -1,8 +1,8 @@
 """A scene as it travels: its XML, the files that it names, and what they must be.
 
 A :class:`Package` says what a scene consists of, by digests of content. Whoever is to load it looks
-for the files where their names say, which serves on one machine and on a shared file system; what
-is not there, or is another, is sent, and is kept in a folder of the receiver under its digest. No
+for the files where their names say, which serves on one machine and on a shared file system. A file
+that is not there, or is another, is sent; the receiver keeps it in a folder under its digest. No
 name that a package holds can lead out of that folder.
 """
 
@@ -46,8 +46,8 @@ class Content:
     """A file by its content.
 
     Attributes:
-        digest (str): of its bytes, 40 hexadecimal digits.
-        suffix (str): of its name, such as ``.exr``: some readers go by it.
+        digest (str): digest of its bytes, 40 hexadecimal digits.
+        suffix (str): suffix of its name, such as ``.exr``: some readers go by it.
         path (str): where its owner has it.
     """
 
@@ -65,7 +65,7 @@ class Content:
         """The name under which a receiver keeps it.
 
         Raises:
-            BadPackage: it would lead elsewhere.
+            BadPackage: the name would lead elsewhere.
         """
         if not _DIGEST.fullmatch(self.digest) or not _SUFFIX.fullmatch(self.suffix):
             raise BadPackage(
@@ -93,7 +93,7 @@ class Store:
     """A folder of files under their digests.
 
     Args:
-        folder: made when the first file arrives.
+        folder: the folder; it is made when the first file arrives.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -199,7 +199,7 @@ class Package:
 
     @property
     def digest(self) -> str:
-        """Of all that decides the scene; where its owner has the files is left out."""
+        """A digest of all that decides the scene, whatever place its owner keeps the files in."""
         parts = [
             [[name, content.digest] for name, content in group]
             for group in (self.documents, self.files)
@@ -239,7 +239,7 @@ def inputs(
         RuntimeError: the XML cannot be read.
     """
     path = Path(filename).absolute()
-    config = mi.parser.ParserConfig(mi.variant())
+    config = mi.parser.ParserConfig(mi.variant() or "")
     state = mi.parser.parse_file(config, str(path), **(definitions or {}))
     files: dict[str, Path] = {}
     for _, _, value in rendering.strings(state):
@@ -252,7 +252,7 @@ def inside(folder: Path, name: str) -> Path:
     """The place of a relative name in a folder.
 
     Raises:
-        BadPackage: it is not in there.
+        BadPackage: the place is not in the folder.
     """
     pure = PurePosixPath(name)
     bad = pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or ":" in name
@@ -282,8 +282,8 @@ def _find(value: str, folder: Path) -> Path | None:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """What must be the same on all machines for their images to be: versions of packages, and of
-    this one the source."""
+    """What must be the same on all machines, so that their images are: the versions of packages,
+    and the source of this one."""
     digest = hashlib.blake2b(digest_size=6)
     for package in ("glintbsdf", "glintbsdf.plugins"):
         folder = Path(next(iter(importlib.import_module(package).__path__)))
@@ -311,9 +311,9 @@ class Job:
 
     Attributes:
         package (Package): the scene.
-        variant (str): of Mitsuba.
+        variant (str): variant of Mitsuba.
         spp (int): samples per pixel.
-        seed (int): of the image.
+        seed (int): seed of the image.
         denoise, trim (bool): see :class:`~glintbsdf.scene.rendering.Renderer` and
             :class:`~glintbsdf.scene.inspection.Trimmed`.
         sensor (str): which, see :func:`~glintbsdf.scene.rendering.chosen_sensor`.

@@ -7,7 +7,7 @@ the samples within reach of the reconstruction filter itself, one after the othe
 precision. A pass is then the same to the last bit for any number of threads, in any process.
 
 A pass knows how many samples the whole image has: as in Mitsuba, ``sampler.sample_count()`` and
-the scale 1/√spp of ray differentials are those of all passes together. What footprints carry does
+the scale 1/√spp of ray differentials belong to all passes together. What footprints carry does
 not depend on how an image is divided into passes.
 """
 
@@ -77,12 +77,12 @@ def sums_of_samples(
         tile: pixels that get samples.
         spp: samples per pixel of this pass.
         total: samples per pixel of the image, by which footprints are scaled.
-        seed: of the sensor's sampler.
+        seed: seed of the sensor's sampler.
         shared: places samples by the film's filter, which then does not spread them.
 
     Returns:
         The tile widened by the reach of the film's filter, within its crop window, and its sums:
-        (height, width, channels) float32. Channels are those of the film's storage: colours times
+        (height, width, channels) float32. The channels are as the film stores them: colours times
         weight, then alpha if there is any, the weight, and the integrator's further channels.
     """
     film = sensor.film()
@@ -209,7 +209,8 @@ def _sums(
     """Filtered sums of samples, (height, width, channels) float32, for the pixels of ``target``.
 
     Args:
-        channels: of all samples of ``tile``, evaluated; those of a pixel follow each other.
+        channels: channels of all samples of ``tile``, evaluated; a pixel's samples follow each
+            other.
         offset: position of each sample in its pixel, in [0, 1]².
         rfilter, border: the filter that spreads samples, over so many pixels on each side.
     """

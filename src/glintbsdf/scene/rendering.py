@@ -46,7 +46,7 @@ def load_scene(
     With ``deferred``, its glint BSDFs build nothing yet: :func:`glint_bsdfs` finds them, and their
     ``build`` is called for what the scene asks of them.
 
-    Gives Dr.Jit a second thread where it has only one: Mitsuba would never return from reading an
+    Dr.Jit gets a second thread where it has only one: Mitsuba would never return from reading an
     OpenEXR file.
     """
     if dr.thread_count() < 2:
@@ -108,8 +108,8 @@ def glint_bsdfs(scene: mi.Scene) -> list:
 def pixel_angle(sensor: mi.Sensor) -> float:
     """Return the angle in radians that a pixel subtends in the middle of the sensor's image.
 
-    It is taken from the ray differentials of the sensor, so that it holds for any projection and
-    crop; the geometric mean of both axes. Parallel projections have 0.
+    It is the geometric mean of both axes. It comes from the ray differentials of the sensor, so
+    that it holds for any projection and crop. Parallel projections have 0.
     """
     middle = mi.Point2f(0.5)
     time, wavelength = mi.Float(0), mi.Float(0.5)
@@ -124,7 +124,7 @@ def chosen_sensor(scene: mi.Scene, which: str = "") -> mi.Sensor:
     """The sensor that a scene is rendered with: by its number, from 0, or its id; the first one.
 
     Raises:
-        ValueError: no sensor, or no such one.
+        ValueError: the scene has no sensor, or no such one.
     """
     sensors = scene.sensors()
     if not sensors:
@@ -144,7 +144,7 @@ def listed(sensors: list[mi.Sensor]) -> str:
 
 @contextmanager
 def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
-    """Give the glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel, in the block.
+    """In the block, give the glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel.
 
     A BSDF whose ``pixel_spread`` is 0 gets the sensor's pixel angle, scaled by 1/√spp as Mitsuba
     scales ray differentials. ``spp`` counts the samples of the whole image; integrators are told
@@ -167,10 +167,10 @@ def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
 
 @contextmanager
 def sharing(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[SharedFilter | None]:
-    """In the block, the scene's ``glint_path``, if that is its integrator, gives footprints their
-    share of the pixel's filter, for an image of ``spp`` samples per pixel in whatever passes.
+    """In the block, let the scene's ``glint_path`` give footprints their share of the pixel's
+    filter, for an image of ``spp`` samples per pixel in whatever passes.
 
-    Yields how samples are to be placed then; None for any other integrator.
+    Yields how samples are to be placed then; None where the scene has another integrator.
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "sharing"):
@@ -189,7 +189,7 @@ class Renderer:
     """A loaded scene, ready to render units of an image; a context manager.
 
     Args:
-        scene: with its BSDFs built, or trimmed.
+        scene: the scene, its BSDFs built or trimmed.
         spp: samples per pixel of the whole image, None for what the scene says. Mitsuba rounds it
             up where the sampler requires it.
         denoise: the image will be denoised, see :mod:`glintbsdf.scene.denoising`.
@@ -198,9 +198,9 @@ class Renderer:
         which: the sensor, see :func:`chosen_sensor`.
 
     Raises:
-        ValueError: no sensor, or a mesh without the UVs that its BSDF needs; or ``denoise`` with
-            an integrator other than ``glint_path``.
-        ModuleNotFoundError: ``denoise``, and no denoiser is installed.
+        ValueError: there is no sensor, or a mesh lacks the UVs that its BSDF needs, or ``denoise``
+            is asked of an integrator other than ``glint_path``.
+        ModuleNotFoundError: ``denoise`` is asked for, and no denoiser is installed.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class Picture:
 
     Attributes:
         bitmap (mi.Bitmap): what is done.
-        fraction (float): of the samples that are in, in (0, 1].
+        fraction (float): the part of the samples that is in, in (0, 1].
         noise (float | None): see :attr:`.Image.noise`.
     """
 
@@ -305,13 +305,13 @@ def produce(
     """Render the image of a seed.
 
     Args:
-        renderer: entered; what plans and develops the image.
+        renderer: plans and develops the image; it has been entered.
         render_all: renders the units; None for ``renderer`` itself. See :func:`.merge` for this
             and the rest.
 
     Raises:
-        Interrupted: by Ctrl-C, when a part of the image was done.
-        KeyboardInterrupt: by Ctrl-C, before.
+        Interrupted: Ctrl-C came when a part of the image was done.
+        KeyboardInterrupt: Ctrl-C came before.
     """
     image = Image(renderer.plan(seed), renderer.sensor.film().base_channels_count() + 1)
     try:
@@ -335,7 +335,7 @@ def picture(renderer: Renderer, image: Image) -> Picture:
     """What is done of an image.
 
     Raises:
-        ValueError: nothing is.
+        ValueError: nothing is done.
     """
     if image.sums is None:
         raise ValueError("no unit of the image is done")
@@ -362,7 +362,7 @@ def render(
 
     Raises:
         ValueError, ModuleNotFoundError: see :class:`Renderer`.
-        Interrupted: by Ctrl-C; it has what is done.
+        Interrupted: Ctrl-C came; the exception has what is done.
     """
     with Renderer(scene, spp, denoise) as renderer:
         done = produce(renderer, seed, observe=lambda image: report(image.fraction))
@@ -427,8 +427,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def _require_whole(written: Path, path: Path) -> None:
     """Raise OSError unless a file has arrived on the disk as a whole.
 
-    An image is read back: OpenEXR's reader finds a missing part as well as a damaged one, Mitsuba's
-    that of a PNG. Of any other file it is known only that it is not empty.
+    An image is read back: OpenEXR's reader finds missing and damaged parts, and so does Mitsuba's
+    reader of PNG. Any other file is only known not to be empty.
     """
     reason = "it is empty"
     try:

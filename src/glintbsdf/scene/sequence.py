@@ -1,5 +1,5 @@
-"""Sequences: the values of each frame's parameters, the names of images, all of them on a sheet or
-in a video."""
+"""Sequences: the values of each frame's parameters, the names of images, and a sheet or a video of
+all of them."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def frames_of(
     """The parameters of each frame.
 
     Args:
-        definitions: of all frames; a value that is a range makes frames.
-        table: parameters of frames, one mapping for each.
+        definitions: parameters of all frames; a value that is a range makes frames.
+        table: parameters of single frames, one mapping for each.
         together: ranges go on together, frame by frame; else frames are made for all combinations,
             of which the last range changes fastest. A table is one more range, the first.
 
@@ -119,8 +119,8 @@ def names_of(template: str, frames: Sequence[Mapping[str, str]]) -> list[Path]:
     """Files of frames, such as ``{index:04}_{alpha}.exr`` describes them.
 
     Args:
-        template: with the fields ``index``, from 0, and those parameters that all frames have;
-            numbers may have formats.
+        template: may have the field ``index``, which counts from 0, and as fields the parameters
+            that all frames have; numbers may have formats.
 
     Raises:
         SequenceError: a field is none of these, or two frames have the same name, or a value would
@@ -174,7 +174,7 @@ def sheet(images: Sequence[Path], columns: int | None = None) -> mi.Bitmap:
     """All images side by side, made smaller where they are large, row by row.
 
     Args:
-        columns: in a row; None for about as many as rows.
+        columns: images in a row; None for about as many as there are rows.
     """
     from skimage.transform import resize
 

@@ -1,4 +1,4 @@
-"""What is done, on disk: files of units and of merged images, and checkpoints made of them.
+"""Files of what is done: units, merged images, and checkpoints made of them.
 
 Every file carries a digest of its content, and is there whole or not at all: it is written beside
 its place, brought to the disk, and moved there. A file that a disk has damaged all the same is
@@ -19,11 +19,11 @@ import numpy as np
 from glintbsdf.scene.image import Image
 from glintbsdf.scene.passes import Tile
 
-#: Of the files of a checkpoint; another number means that they cannot be read.
+#: The format of a checkpoint's files. Files with another number cannot be read.
 FORMAT = 1
 
-#: Units between two files of merged sums: so many are made again at most where one is damaged, and
-#: twice as many files of units are kept.
+#: Units between two files of merged sums. At most so many are made again where one file is damaged,
+#: and twice as many files of units are kept.
 UNITS_PER_SNAPSHOT = 16
 
 _DIGEST = 32  # bytes
@@ -46,8 +46,8 @@ def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to a file that appears whole, and survives a loss of power once this returns.
 
     Raises:
-        OSError: with a sentence that names the file, as where the disk is full. What was there
-            before stays.
+        OSError: the file cannot be written, as where the disk is full. The message names the file.
+            What was there before stays.
     """
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # an array may have any name
@@ -85,7 +85,7 @@ def read(path: Path) -> dict[str, np.ndarray] | None:
     """The arrays of a file; None if there is none.
 
     Raises:
-        Damaged: it does not hold what was written.
+        Damaged: the file does not hold what was written.
     """
     try:
         content = path.read_bytes()
@@ -139,12 +139,13 @@ class UnitFiles:
 class Checkpoint:
     """A folder that keeps what is done of an image.
 
-    It holds a description of the image, the units that are done, and, every
-    :data:`UNITS_PER_SNAPSHOT` units, the sums of all units so far; the last two of these, and the
-    units since the former of them. The folder's size does not depend on the number of samples.
+    It holds a description of the image and the units that are done. Every
+    :data:`UNITS_PER_SNAPSHOT` units it also gets the sums of all units so far. It keeps the last
+    two such files, and the units since the former of them. The folder's size does not depend on
+    the number of samples.
 
     Args:
-        folder: made if it is not there.
+        folder: the folder; it is made if it is not there.
         description: what decides the image, in words and numbers that JSON can write.
 
     Raises:

@@ -18,10 +18,10 @@ import mitsuba as mi
 
 from glintbsdf.scene.passes import Tile
 
-#: Samples of a unit, at least, where the image has so many: a second's work of two CPU cores.
+#: Samples of a unit, at least, where the image has so many.
 FEWEST = 1 << 18
 
-#: Samples of a unit, at most: they need about 200 MB while they are rendered.
+#: Samples of a unit, at most: this bounds the memory of a unit that is rendered.
 MOST = 1 << 21
 
 
@@ -34,7 +34,7 @@ class Unit:
         part (int): the number of its pass: all tiles of a pass make one image of few samples.
         tile (Tile): the pixels that get samples.
         spp (int): samples in each of them.
-        seed (int): of the sampler.
+        seed (int): seed of the sampler.
         stratified (bool): the samples of a pixel must stay together.
         divisible (bool): the integrator can render a part of the tile.
     """
@@ -144,7 +144,7 @@ class Plan(Sequence[Unit]):
 
 
 def derived_seed(seed: int, index: int) -> int:
-    """A seed for the unit ``index`` of what has the seed ``seed``."""
+    """The seed of the part numbered ``index`` of what has the seed ``seed``."""
     return int(mi.sample_tea_32(seed, index)[0])
 
 
