@@ -1,6 +1,7 @@
 r"""Mitsuba plugins, one module each, named after the plugin's type.
 
-The docstring of each is its documentation page. What a page calls *Shared* is here, once:
+The docstring of each is its documentation page. The parameters that a page calls *Shared* are
+described here, once:
 
 .. pluginparameters::
 
@@ -15,14 +16,14 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
 
  * - data
    - |tensor|
-   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. What is exposed is
-     the map in use: the projected normals, H×W×2.
+   - The map as a tensor of H×W×C values, C = 1…4, instead of :monosp:`filename`. Exposed is the map
+     in use: the projected normals, H×W×2.
    - |exposed|, |differentiable|
 
  * - layer
    - |string|
    - Layer of an OpenEXR file that has several. (Default: one called "normal", or "height" for a
-     height; else that without a name)
+     height; else the layer without a name)
 
  * - map_type
    - |string|
@@ -52,9 +53,9 @@ The docstring of each is its documentation page. What a page calls *Shared* is h
 
  * - fill_voids
    - |bool|
-   - Whether texels that hold nothing take the normal of the nearest that do, rather than being
-     refused: NaN, the black or transparent padding of an atlas, and a height's −9999, −32767,
-     −32768 or what the file names. How many is logged. (Default: |false|)
+   - Whether texels that hold nothing take the normal of the nearest texel that does, rather than
+     being refused. Such are NaN, the black or transparent padding of an atlas, and a height's −9999,
+     −32767, −32768 or the value that the file names. Their number is logged. (Default: |false|)
 
  * - wrap_mode
    - |string|

@@ -18,7 +18,8 @@ Diffuse facets of a normal map (:monosp:`glint_diffuse`)
    - |string|
    - :monosp:`manifold`: the facets under the footprint, every one of them; or
      :monosp:`oren_nayar`: Oren and Nayar's model, as rough as the footprint's facets, around their
-     mean normal. Faster, and blind to what is smaller than a pixel. (Default: :monosp:`manifold`)
+     mean normal. It is faster, and blind to what is smaller than a pixel.
+     (Default: :monosp:`manifold`)
 
  * Shared: footprint_sigma, pixel_spread
 
@@ -38,8 +39,8 @@ A facet counts with its own area, which is larger than the surface's below it; f
 nor light each other. For steep maps the surface therefore reflects more than
 :monosp:`reflectance`, by a quarter of the mean squared slope.
 
-Footprints of up to 4096 texels are summed facet by facet, larger ones over as many facets, spread
-evenly: the cost of a large footprint is bounded, but large.
+Footprints of up to 4096 texels are summed facet by facet; larger ones are summed over as many
+facets, spread evenly. The cost of a large footprint is bounded, but large.
 
 The material is one-sided: use the ``twosided`` adapter for both sides. The shape needs UV
 coordinates.

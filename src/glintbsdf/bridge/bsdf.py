@@ -57,7 +57,7 @@ class FootprintBSDF(mi.BSDF):
         to_uv (mi.ScalarAffineTransform3f): transform of UV space.
         footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
         normal_map (NormalMap): the map as it was loaded, None without one.
-        watch (Recorder | Gate): who looks at every footprint; nobody by default.
+        watch (Recorder | Gate): looks at every footprint; None by default.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
     """
@@ -82,7 +82,7 @@ class FootprintBSDF(mi.BSDF):
         return None if self.normal_map is None else self.normal_map.shape
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make what queries within ``domain`` need, or any query; whatever there was, goes."""
+        """Make what queries within ``domain`` need, or any query; what was built before goes."""
         raise NotImplementedError
 
     def parts(self) -> dict[str, int]:
@@ -198,7 +198,7 @@ class FootprintBSDF(mi.BSDF):
         )
 
     def members(self) -> dict[str, object]:
-        """What describes this BSDF in print, by name; None is left out."""
+        """What describes this BSDF in print, by name; values of None are left out."""
         return {
             "to_uv": None if self.to_uv == type(self.to_uv)() else self.to_uv,
             "footprint_sigma": self.footprint_sigma[0],
@@ -224,10 +224,10 @@ class GlintBSDF(FootprintBSDF):
     Attributes:
         pndf (PNDF): the P-NDF. None as long as nothing is built: a smooth surface of the map's
             overall roughness then takes its place.
-        masking (SmithMasking): of the P-NDF's facets; None for none.
+        masking (SmithMasking): masking of the P-NDF's facets; None for none.
         smooth (PNDF): what all glints add up to, which takes their place in a
             ``separation.smooth_context()``; None where the P-NDF is smooth by itself.
-        smooth_masking (SmithMasking): of the facets of ``smooth``.
+        smooth_masking (SmithMasking): masking of the facets of ``smooth``.
         interface (Interface): what happens at a facet.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
@@ -262,7 +262,7 @@ class GlintBSDF(FootprintBSDF):
         raise NotImplementedError
 
     def finish(self) -> None:
-        """End of a subclass's constructor: build, unless somebody else will."""
+        """End a subclass's constructor: build, unless somebody else will."""
         if not self.deferred:
             self.build()
         elif self.normal_map is not None:
@@ -339,7 +339,7 @@ class GlintBSDF(FootprintBSDF):
         # of the surface, is an invalid sample: its mass is missing from the pdf as well.
         query = self.query(si, active)
         pndf, masking = self.facets(ctx, si)
-        # It is kept where it is: derivatives of an estimate are those of what it weighs.
+        # The sample stays where it is: the derivatives of an estimate are those of its weight.
         m = dr.detach(pndf.sample_visible(wi, query, sample1, sample2, active))
         wo, active = component.scattered(wi, m, active)
         density = self.density(pndf, m, query, si, active)

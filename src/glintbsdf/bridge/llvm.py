@@ -53,9 +53,9 @@ class Library(NamedTuple):
 def choose() -> None:
     """Name the newest usable LLVM to Dr.Jit, unless one is named or loaded already.
 
-    Called when the package is imported. Does nothing where no usable library is found, as a program
-    that runs on the GPU needs none, nor where Dr.Jit was imported before and has made its choice.
-    :func:`require_usable` tells everybody else.
+    It is called when the package is imported. It does nothing where no usable library is found, as a
+    program that runs on the GPU needs none, or where Dr.Jit was imported before and has made its
+    choice. Then :func:`require_usable` tells those who need one.
     """
     if VARIABLE in os.environ or "drjit" in sys.modules:
         return
@@ -85,7 +85,7 @@ def require_usable() -> None:
     elif named:
         remedy = f"Before Python starts, type: export {VARIABLE}={usable.path}"
     else:
-        # Found, but too late: Dr.Jit chooses its LLVM when it is imported.
+        # A library is there, but too late: Dr.Jit chooses its LLVM when it is imported.
         remedy = (
             "Import glintbsdf before mitsuba and drjit, or, before Python starts, "
             f"type: export {VARIABLE}={usable.path}"

@@ -56,8 +56,9 @@ def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:
 def _holds(material: mi.Object, bsdf: mi.BSDF) -> bool:
     """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth.
 
-    By Mitsuba's own traversal: a callback class that is made here and knows ``bsdf`` would keep it
-    alive, as every class is part of a cycle, and Dr.Jit records calls of every BSDF that is alive.
+    Mitsuba's own traversal finds it. A callback class that is made here and knows ``bsdf`` would
+    keep it alive, as every class is part of a cycle, and Dr.Jit records calls of every BSDF that is
+    alive.
     """
     return any(node is bsdf for node in mi.traverse(material).hierarchy)
 
@@ -84,9 +85,10 @@ def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:
 def uv_orientation(shape: mi.Shape) -> int:
     """1 where u, v and the normal of a surface are right-handed, -1 where left-handed, else 0.
 
-    Left-handed are mirrored UVs, and those of every OBJ file as Mitsuba loads it. Judged by area;
-    meshes whose faces disagree give 0, as do shapes that cannot tell. The registry gives a shape of
-    no more than the class that Python has first seen it as, so a mesh is asked by its parameters.
+    Mirrored UVs are left-handed, and so are the UVs of every OBJ file as Mitsuba loads it. Faces
+    count by area; meshes whose faces disagree give 0, as do shapes that cannot tell. The registry
+    knows a shape only by the class that Python has first seen it as, so a mesh is asked by its
+    parameters.
     """
     buffers = mi.traverse(shape) if shape.is_mesh() else {}
     if "vertex_texcoords" not in buffers:  # a rectangle, a sphere, …
@@ -123,8 +125,8 @@ def doubt_of_green(
     """A sentence where the normals would fit together on these shapes if green were reversed.
 
     A normal's second component points along v on right-handed UVs and against it on left-handed
-    ones, as the shading frame does; ``to_uv`` may mirror the map once more. Empty where
-    ``flip_y`` was given, where the shapes disagree, and where nothing speaks for the reverse.
+    ones, as the shading frame does; ``to_uv`` may mirror the map once more. The sentence is empty
+    where ``flip_y`` was given, where the shapes disagree, and where nothing speaks for the reverse.
     """
     if normal_map is None or normal_map.green_is_given:
         return ""

@@ -31,8 +31,8 @@ def partition(points: Array) -> tuple[Array, Array]:
     """Cut the square [−1, 1]² into cells that hold few of ``points`` (N, 2) each.
 
     Empty margins and gaps are cut off first, so that the cells close around clusters of points of
-    any size; then cells are halved by number. Returns the cells (K, 2, 2: lower and upper corner),
-    and the cell of each point.
+    any size; then each cut halves the number of points. Returns the cells (K, 2, 2: lower and upper
+    corner), and the cell of each point.
     """
     cells: list[np.ndarray] = []
     cell_of = np.empty(len(points), np.int64)
@@ -53,7 +53,7 @@ def partition(points: Array) -> tuple[Array, Array]:
 
 
 def cut_of(box: Array, points: Array) -> tuple[int, float] | None:
-    """Where to cut a cell: axis and place; None where that makes no sense any more."""
+    """Where to cut a cell, as axis and place; None where a cut makes no sense any more."""
     low, high = points.min(0), points.max(0)
     margin = 0.1 * (high - low) + NARROWEST
     empty = np.stack([low - margin - box[0], box[1] - high - margin]) / (box[1] - box[0])
@@ -104,7 +104,7 @@ def mass_of(density: Callable, cells: Array, points: Array, cell_of: Array) -> t
         # Points where the quadrature has found next to nothing: it has missed a spike.
         missed = share > mass + 3 * np.sqrt((mass + 0.1 / count) / count) + 2 * error
         doubt = np.maximum(error, np.where(missed, share - mass, 0))
-        # Those that make up most of the doubt, as cells of equal doubt are what is aimed at.
+        # The boxes that make up most of the doubt: the aim is boxes of equal doubt.
         cut = doubt > min(0.5 * doubt.max(), TARGET / np.sqrt(len(boxes)))
         if len(boxes) > MOST_BOXES:
             cut &= missed
@@ -143,8 +143,8 @@ def density(bsdf: mi.BSDF, view: View, samples: int) -> dict[str, float]:
 
     ``mass``: ∫ pdf + share of invalid samples − 1, with the standard error ``mass_error``; a sample
     is invalid where the normal reflects the view below the horizon, where the pdf is 0 as well.
-    ``p_value``: of Pearson's χ² test of half of the samples against the pdf, in cells that the
-    other half has shaped.
+    ``p_value`` comes from Pearson's χ² test of half of the samples against the pdf, in cells that
+    the other half has shaped.
     """
     si, bs, _ = suite.sample(bsdf, view, 2 * samples, seed=3)
     m = np.array(dr.normalize(si.wi + bs.wo), np.float64)[:2].T

@@ -2,9 +2,9 @@
 
 A case is a plugin and one or two of its parameters with values of any kind: numbers from 1e-45 to
 1e39, NaN, names, colours, vectors, transforms, tensors, images, textures, nested materials; and
-parameters that do not exist. One of two must come of it: an error of one sentence that names the
-plugin and the parameter that was written; or a BSDF that evaluates and samples to finite numbers
-from the zenith to the horizon, for footprints from a point to many maps.
+parameters that do not exist. It must end in one of two ways: with an error of one sentence that
+names the plugin and the parameter that was written; or with a BSDF that evaluates and samples to
+finite numbers from the zenith to the horizon, for footprints from a point to many maps.
 
 :func:`cases` and :func:`outcome` work in this process. :func:`fuzz` runs any number of cases in
 processes of their own, so that crashes and endless loops are outcomes as well. It is the long check
@@ -87,7 +87,7 @@ class Case(NamedTuple):
 
 
 def cases(seed: int, count: int, plugins: tuple[str, ...] = ()) -> Iterator[Case]:
-    """``count`` cases, the same for the same seed; of ``plugins``, or of all that declare
+    """``count`` cases, the same for the same seed, for ``plugins`` or for all that declare
     parameters."""
     from glintbsdf.bridge.parameters import PARAMETERS, Number
 

@@ -27,8 +27,8 @@ class Comparison:
     """A P-NDF on the bins of its reference.
 
     ``density`` is res x res, rows from low to high y, each element the mean over random points of
-    its bin, and ``standard_error`` that of this mean. ``seconds`` is the time of the ``queries``
-    evaluations of the density, compilation excluded.
+    its bin, and ``standard_error`` the standard error of this mean. ``seconds`` is the time of the
+    ``queries`` evaluations of the density, compilation excluded.
     """
 
     density: np.ndarray
@@ -83,7 +83,7 @@ def compare(
         sigma: its standard deviation in texels.
         res: bins along each axis, over the range of the map's normals.
         parameters: further parameters of the plugin, as strings.
-        samples_per_bin: of the reference, on average.
+        samples_per_bin: samples of the reference in a bin, on average.
 
     Raises:
         ParameterError: the plugin has no P-NDF to draw.

@@ -2,7 +2,7 @@
 
 It follows the definition of the P-NDF word for word: draw positions from the footprint's kernel,
 look up the normal there, count how many land in each bin of a grid over the unit disk. There is no
-approximation but noise, and the noise is told: plain independent samples, hence binomial counts.
+approximation but noise, and the noise is known: samples are independent, so counts are binomial.
 
 The surface is the mesh of Wu et al. 2024 (Wu24), whose vertices are the texel centres. The quad of
 texels ``n0 = (i, j)``, ``n1 = (i, j+1)``, ``n2 = (i+1, j)``, ``n3 = (i+1, j+1)`` has the triangles
@@ -34,7 +34,7 @@ Bounds = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class BinnedPNDF:
-    """A binned P-NDF. Unpacks as ``density, standard_error = …``.
+    """A binned P-NDF, which unpacks as ``density, standard_error = …``.
 
     ``density`` is a res x res array, per unit area of the disk: element [i, j] is the mean of D
     over the bin ``edges_y[i] <= y < edges_y[i + 1]``, ``edges_x[j] <= x < edges_x[j + 1]``.
@@ -99,7 +99,7 @@ def binned_pndf(
     covariance's diagonal). ``epsilon`` is the Jacobian clamp, ``sigma_r`` the standard deviation of
     a further isotropic Gaussian roughness on the disk. ``bounds`` is the rectangle of the grid
     (default :func:`normal_bounds`); normals outside it count in no bin, so the grid's sum times the
-    bin area is the probability of the rectangle. Ten million ``samples`` take about three seconds.
+    bin area is the probability of the rectangle.
     Raises :class:`~.ParameterError` on bad parameters.
     """
     owner = "binned_pndf"

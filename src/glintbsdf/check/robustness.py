@@ -29,7 +29,7 @@ from glintbsdf.pndf import Grid
 Array = np.ndarray
 
 # --------------------------------------------------------------------------------------------------
-#  Extremes: many lanes, each a combination of what breaks what is written carelessly
+#  Extremes: many lanes, each a combination of values that break careless code
 # --------------------------------------------------------------------------------------------------
 
 #: Larger standard deviation of a footprint (maps), ratio of both, and inclination of a direction.
@@ -87,8 +87,9 @@ def vector(kind: type, values: Array):
 def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
     """How many lanes show what is not finite (``nan``), and how many what is ``negative``.
 
-    Looked at: direction, density and weight of samples, values and densities there and in other
-    directions down to the horizon, albedo; all values as reflected of a light of ``RADIANCE``.
+    It looks at direction, density and weight of samples; at values and densities there and in other
+    directions down to the horizon; and at the albedo. All values are those of light of
+    ``RADIANCE`` that is reflected.
     """
     si = extreme_interaction(count, seed)
     u = suite.random_numbers(count, 3, seed)
@@ -130,9 +131,9 @@ def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
 
 
 def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> list[dict[str, float]]:
-    """Of each view what share of uniform light is reflected, ``energy`` and its standard ``error``.
+    """The share of uniform light that each view reflects: ``energy``, and its standard ``error``.
 
-    ``spread``: footprints lie at places up to this far from the view's; 0 is one place.
+    ``spread``: footprints lie at places up to this far from the view's; 0 means one place.
     """
     count = len(views) * samples
     si = View().interaction(count)
@@ -160,7 +161,8 @@ def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> lis
 def mean_of_grid(bsdf: GlintBSDF, count: int) -> list[dict[str, float | str]]:
     """``mass``: the mean, less one, of the density of ``glint_grid`` over its expectation.
 
-    Over random places and normals, for footprints of some hundred microdetails, which lie apart.
+    The mean is over random places and normals, for footprints of some hundred microdetails, which
+    lie apart.
     """
     pndf = bsdf.pndf
     if not isinstance(pndf, Grid):
@@ -295,8 +297,8 @@ def double_error(bsdf: mi.BSDF, load: Callable[[], mi.BSDF], count: int) -> dict
 
     ``load``: makes another ``bsdf``, here in float64.
 
-    ``last_digit`` is the same of float64 for a normal and a place that differ in the last digit of
-    float32: what no computation on such numbers can be blamed for.
+    ``last_digit`` is the same error in float64, between normals and places that differ in the last
+    digit of float32: no computation on such numbers can be blamed for it.
     """
     asked = queries(bsdf, count)
     single = np.float64(asked.value(bsdf, mi))
@@ -371,7 +373,7 @@ def square(x: float, texcoords: list[float], bsdf: mi.BSDF) -> mi.Mesh:
 def bright_light(bsdf: mi.BSDF) -> dict[str, float]:
     """A picture in light of 1 and of ``BRIGHT``: ``apart``, their relative L1 difference, scaled.
 
-    ``nan`` and ``negative`` count channels of pixels of the second.
+    ``nan`` and ``negative`` count such channels of pixels in the second picture.
     """
     scene = scene_of_squares(bsdf)
     plain = np.array(mi.render(scene, seed=1), np.float64)

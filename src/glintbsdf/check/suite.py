@@ -95,7 +95,7 @@ def square(
     return image
 
 
-# Views that break what is written carelessly, for a map of any size.
+# Views that break careless code, for a map of any size.
 EXTREME_VIEWS = {
     "point": View(),
     "tiny": View(du=(1e-7, 0), dv=(0, 1e-7)),
@@ -170,10 +170,11 @@ def mass_in_bins(
 
 
 def p_value(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray) -> float:
-    """Of Pearson's χ² test of ``counts`` in bins, out of ``total``, against the ``mass`` of each.
+    """The p-value of Pearson's χ² test of ``counts`` in bins, out of ``total``, against ``mass``.
 
-    What the quadrature errs (``error``, a standard deviation) adds to the variance of a count. The
-    emptiest bins are taken together until they hold five expected counts.
+    ``mass`` is the expected share of each bin. The error of the quadrature (``error``, a standard
+    deviation) adds to the variance of a count. The emptiest bins are taken together until they hold
+    five expected counts.
     """
     order = np.argsort(mass, axis=None)
     counts, expected = counts.ravel()[order], total * mass.ravel()[order]
@@ -256,7 +257,7 @@ def check_chi2(
 
     ``bounds`` is a rectangle of the disk that holds all normals; the view must be such that nothing
     is reflected below the horizon. A sample drawn on the very edge of a clamped triangle, which has
-    no neighbour, may be lost to float32 rounding: up to 1e-4 of them, four times what was measured.
+    no neighbour, may be lost to float32 rounding: up to 1e-4 of them may.
     """
     si, bs, _ = sample(bsdf, view, samples)
     m = np.array(dr.normalize(si.wi + bs.wo))[:2, np.array(bs.pdf) > 0]
@@ -267,7 +268,7 @@ def check_chi2(
 
     mass, error = mass_in_bins(bsdf, view, bounds, res)
     assert_distributed(counts, samples, mass, error, test_count, bounds)
-    # 1e-4: float32 rounding, of the area of triangles above all.
+    # 1e-4 is for float32 rounding, above all in the area of triangles.
     assert abs(mass.sum() - 1) <= 4 * np.sqrt((error**2).sum()) + 1e-4, mass.sum()
 
 
@@ -393,7 +394,7 @@ def check_adjoint(bsdf: mi.BSDF, view: View, count: int = 500, strays: float = 0
 
 
 def check_furnace(bsdf: mi.BSDF, *views: View, count: int = 20_000) -> None:
-    """Of uniform light views reflect, on average, no more than arrives, but for noise (3 sigma)."""
+    """Views reflect, on average, no more of uniform light than arrives, but for noise (3 sigma)."""
     weights = [intensity(sample(bsdf, view, count)[2]) for view in views]
     weight = np.hstack([np.atleast_2d(np.array(w)) for w in weights])
     noise = weight.std(axis=1) / np.sqrt(weight.shape[1])
@@ -435,7 +436,7 @@ def check_render_derivative(
     modes: tuple[str, ...] = ("reverse",),
     resolution: float = 0.5,
 ) -> None:
-    """Derivatives of an image with respect to a parameter are those of the image.
+    """Derivatives of an image with respect to a parameter agree with differences of images.
 
     The image, of a plate under a spherical lamp, is weighed by itself, so that contrast counts as
     well as brightness. Automatic derivatives are compared with central differences of the same

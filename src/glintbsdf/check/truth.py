@@ -4,9 +4,9 @@ Mitsuba's own ``normalmap`` around ``roughconductor`` of tiny roughness turns ev
 into a mirror. Pixels average over what they see by sampling alone, so images need thousands of
 samples per pixel, and no footprint, structure or estimator of this package can be at fault.
 
-What differs from a glint BSDF by definition: a bumped mirror reflects all light that meets it,
+One thing differs from a glint BSDF by definition. A bumped mirror reflects all light that meets it,
 while a microsurface without masking shows its facets by the area they turn to the viewer, as
-``w·m / (m_z w_z)``. Both agree at normal incidence; elsewhere their means do with masking, or to
+``w·m / (m_z w_z)``. Both agree at normal incidence. Elsewhere their means agree with masking, or to
 first order in the slopes where these average to zero.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.maps.normalmap import NormalMap
 
-#: Roughness of the mirrors: as half vectors, a tenth of the radius of the sun's disk.
+#: Roughness of the mirrors. In half vectors it is a tenth of the radius of the sun's disk.
 ALPHA = 2e-4
 
 
@@ -160,7 +160,7 @@ class Truth:
     def relative_rmse(self, image: np.ndarray) -> float:
         """Root mean square difference of another image over the mean, without this one's noise.
 
-        Below zero noise has been subtracted that is not there: 0 then.
+        It is 0 where more noise would be subtracted than there is.
         """
         squared = ((np.asarray(image, np.float64) - self.image) ** 2).mean()
         squared -= (self.standard_error**2).mean()
