@@ -54,8 +54,9 @@ described here, once:
  * - fill_voids
    - |bool|
    - Whether texels that hold nothing take the normal of the nearest texel that does, rather than
-     being refused. Such are NaN, the black or transparent padding of an atlas, and a height's −9999,
-     −32767, −32768 or the value that the file names. Their number is logged. (Default: |false|)
+     being refused. Such are NaN, the black or transparent padding of an atlas, and a height's
+     −9999, −32767, −32768 or the value that the file names. Their number is logged.
+     (Default: |false|)
 
  * - wrap_mode
    - |string|

@@ -53,8 +53,8 @@ class Library(NamedTuple):
 def choose() -> None:
     """Name the newest usable LLVM to Dr.Jit, unless one is named or loaded already.
 
-    It is called when the package is imported. It does nothing where no usable library is found, as a
-    program that runs on the GPU needs none, or where Dr.Jit was imported before and has made its
+    It is called when the package is imported. It does nothing where no usable library is found, as
+    a program that runs on the GPU needs none, or where Dr.Jit was imported before and has made its
     choice. Then :func:`require_usable` tells those who need one.
     """
     if VARIABLE in os.environ or "drjit" in sys.modules:

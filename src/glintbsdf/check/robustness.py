@@ -13,18 +13,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import radians
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.check import suite
 from glintbsdf.check.suite import View
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
 from glintbsdf.pndf import Grid
+
+if TYPE_CHECKING:
+    from glintbsdf.bridge.bsdf import GlintBSDF
 
 Array = np.ndarray
 
