@@ -342,7 +342,7 @@ class Elements(Mixture):
         step (float): h, texels from one seed to the next. It is rounded so that a whole number of
             steps makes the map.
         curved (bool): whether elements follow the map's Jacobian (Eq. 13) or are flat (Eq. 12).
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
         domain (Domain): what will be asked; None for anything. Where all footprints are summed cell
             by cell, no lists are made; within the domain D is the same to the last bit.
         data (mi.TensorXf): the normals of ``normal_map`` where they carry derivatives.

@@ -75,7 +75,7 @@ class Flakes(Mixture):
         alpha (float): Beckmann roughness of the flakes' normals, ≥ 0.
         sigma_r (float): intrinsic roughness σ_r of each.
         seed (int): of the pattern and the normals.
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
 
     Attributes:
         flake_alpha (mi.Float): α. Its derivatives are those of flakes whose slopes grow with it:

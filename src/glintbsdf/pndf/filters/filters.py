@@ -175,7 +175,7 @@ class Filtered(PNDF):
         alpha (float): roughness of the material, > 0; Toksvig's formula ends at 1.
         distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
         max_anisotropy (float): ≥ 1, see :class:`~.MomentPyramid`.
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
         domain (Domain): what will be asked; None for anything. MIP levels that no such footprint
             needs are then left out. Lobes within the domain are the same to the last bit.
 

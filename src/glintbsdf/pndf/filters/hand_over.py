@@ -29,7 +29,7 @@ class HandOver(PNDF):
     Args:
         near: the P-NDF of a normal map.
         sigma (float): texels, > 0.
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
         domain (Domain): what will be asked, see :class:`Filtered`.
     """
 

@@ -9,8 +9,8 @@ of 2^l × 2^l quads by two triangles, whose vertex normals n_0^l…n_3^l are the
 Over a triangle of the map the integrand is a quadratic polynomial, and the diagonals of clusters
 and quads align, so that every triangle of the map lies in one half of the cluster. Its integral is
 thus exact by the rule of the three midpoints of edges, and a cluster needs only the moments, up to
-the second, of the map over its two halves; those of a parent are sums of its children's, so that
-all levels together cost little more than the first. NumPy, float64; no Dr.Jit.
+the second, of the map over its two halves. A parent's moments are sums of its children's, so that
+all levels together cost little more than the first. All is NumPy in float64, without Dr.Jit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-#: Quads in a strip whose moments are held at once, 208 bytes each.
+#: Quads in a strip whose moments are held at once; each takes 208 bytes.
 STRIP_QUADS = 1 << 18
 
 #: Added to the diagonal of A, relative to its mean, against singular systems. The true A has none:

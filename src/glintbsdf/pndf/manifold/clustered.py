@@ -58,9 +58,10 @@ from glintbsdf.pndf.manifold.mesh import (
 #: larger than a block.
 RUNG = 0.25
 
-#: The first rung that is made. Measured on rough maps, lists of a quarter of the elements take as
-#: long as those of the quads, because larger triangles reach into more cells of normals: an error
-#: for nothing. From a sixteenth on they are faster. Smooth maps reach higher rungs at once.
+#: The first rung that is made. On rough maps, lists of a quarter of the elements take as long as
+#: the lists of the quads, because larger triangles reach into more cells of normals: they would
+#: bring an error for nothing. From a sixteenth on they are faster. Smooth maps reach higher rungs
+#: at once.
 FIRST_RUNG = 2
 
 #: A map that goes on as its border does (clamp) is stored with borders as wide as the largest
@@ -83,8 +84,9 @@ COLUMN_BITS = 27
 def on_cut(residuals: list[np.ndarray], threshold: float) -> list[np.ndarray]:
     """Which clusters of each level 1, 2, … are on the cut: the coarsest with e^l ≤ ``threshold``.
 
-    ``residuals``: of all levels that may be used, (rows, columns) each; a cluster that the border
-    of the stored lattice would cut through does not exist, and its children stand for themselves.
+    ``residuals``: the residuals of all levels that may be used, (rows, columns) each. A cluster
+    that the border of the stored lattice would cut through does not exist: its children stand for
+    themselves.
     """
     result = []
     taken = None  # by an ancestor
@@ -128,7 +130,7 @@ def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: floa
         threshold = smallest_threshold(quads, usable, quads * RUNG**rung, limit)
         if threshold is None:
             break
-        # Without those that no query would use, as the next has no higher threshold.
+        # Rungs that no query would use are left out: the next one has no higher threshold.
         cuts = [cut for cut in cuts if cut[0] < threshold]
         cuts.append((threshold, on_cut(usable, threshold), SHIFT + rung))
     return cuts
@@ -170,7 +172,7 @@ class ClusterLattice:
         x, y (LatticeAxis): columns and rows. Where the map is clamped, their borders are wider than
             those of the mesh, see :data:`BORDER`.
         rungs (int): the highest rung of the ladder, 0 where the map is too small for any.
-        levels (int): of clusters.
+        levels (int): number of levels of clusters.
         shapes (list of pairs): rows and columns of whole clusters, by level; level 0 is the quads.
         first (list): clusters of lower levels than each, and the number of all.
         surplus (int): a quad of the mesh has this more as row and column here.
@@ -227,18 +229,18 @@ class CellsOfRung(NormalCells):
 class Ladder:
     """A ladder of cuts through the tree of clusters, with inverted lists for each.
 
-    Made of the arrays of :meth:`build` (NumPy), wherever they were kept since; K rungs:
-        ``thresholds`` (K): the least r_x r_y τ of the queries that use the cuts 1…K, 0 being no
-        clusters at all. Nothing else where K = 0;
-        ``residuals`` (N): of the clusters of all levels that are reached, level by level;
-        ``normals`` (N, 4, 2): theirs;
+    It is made of the arrays (NumPy) that :meth:`build` returns; there are K rungs:
+        ``thresholds`` (K): the least r_x r_y τ of the queries that use the cuts 1…K; cut 0 has no
+        clusters at all. Where K = 0, there is no other array;
+        ``residuals`` (N): residuals of the clusters of all levels that are reached, level by level;
+        ``normals`` (N, 4, 2): normals of these clusters;
         ``shifts`` (K): log2 of the side of the blocks;
         ``lower``, ``upper`` (2), ``divisions`` (K): the rectangle of normals, and its cells;
         ``elements`` (…, 2): column and level, and row, of the elements, block by block;
         ``first_of_row``: the first of each row of blocks;
-        and those of :class:`~.QuadLists`, whose entries are places among
-        the elements of a row of blocks. Of these, the arrays of all rungs stand one after the
-        other; ``begin`` (K, …): where each begins.
+        and the arrays of :class:`~.QuadLists`, whose entries are places among the elements of a row
+        of blocks. The arrays of all rungs stand one after the other; ``begin`` (K, …) says where
+        each begins.
     """
 
     start: mi.UInt32
@@ -347,9 +349,9 @@ class Ladder:
               triangles_of) -> dict[str, np.ndarray]:  # fmt: skip
         """Fit the clusters, choose the cuts, build their lists.
 
-        ``normals`` (H, W, 2): those of the map; ``limit``: the largest r_x r_y τ that can occur;
-        ``triangles_of(normals)``: given those of the clusters (N, 4, 2), a function of row, column,
-        level and a mask that returns an element's two triangles.
+        ``normals`` (H, W, 2) are the map's; ``limit`` is the largest r_x r_y τ that can occur;
+        ``triangles_of(normals)``, given the clusters' normals (N, 4, 2), returns a function of row,
+        column, level and a mask that returns an element's two triangles.
         """
         rows, columns = lattice.y.quads, lattice.x.quads
         clusters, residuals = [], []
@@ -481,7 +483,7 @@ class ClusteredManifold(Manifold):
     exact, and so are maps smaller than 32 texels (512, where the map is clamped).
 
     A cluster's triangle of an area below ε/2 on the disk, whatever its size in texels, is replaced
-    as the map's own are: a flat part of the map keeps the size that its highlight has without
+    like a triangle of the map: a flat part of the map keeps the size that its highlight has without
     clusters.
 
     Args:

@@ -174,7 +174,7 @@ class TexelMesh:
         normal_map (NormalMap): the map.
         kernel (str): ``gaussian``, ``disk`` or ``box``, see :mod:`glintbsdf.footprint.kernels`.
         epsilon (float): smallest Jacobian determinant |det J| of a triangle, in (0, 1).
-        owner (str): whom errors name, usually the plugin.
+        owner (str): the name that errors give, usually the plugin's.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a

@@ -29,10 +29,10 @@ MAX_NARROWING = 0.6
 #: largest that :data:`MAX_NARROWING` allows.
 KNOTS = {"gaussian": (0.45, 0.7, 0.95), "disk": (0.25, 0.55, 0.95), "box": (0.25, 0.55, 0.95)}
 
-#: Places at which they are; the finest level is compared with the map at the first few.
+#: Places at which grains are measured; at the first few, the finest level is compared with the map.
 PLACES, PLACES_ON_MAP = 16, 6
 
-#: Bins, about, in which they are.
+#: Number of bins in which grains are measured, about.
 CALIBRATION_BINS = 3000
 
 
@@ -52,7 +52,7 @@ def kernel_error(kernel: str, x, mixed: bool = False):
 def narrowing(variance: float, kernel: str = "gaussian") -> float:
     """Variance to take off a footprint against what the functions of the nodes add, texels².
 
-    ``variance`` (texels²): that of the function.
+    ``variance`` (texels²): variance of the function of a node.
     """
     return variance / VARIANCE[kernel]
 
@@ -86,15 +86,15 @@ def fitted(kernel: str, grains, spacing: float, mixed: bool, minor, mean):
 
 
 def predicted(kernel: str, grains, spacing: float, mixed: bool, minor, mean):
-    """As :func:`fitted`, with a margin, so that errors measured are below."""
+    """As :func:`fitted`, with a margin, so that measured errors are below."""
     return margin(kernel, spacing / mean) * fitted(kernel, grains, spacing, mixed, minor, mean)
 
 
 def margin(kernel: str, x):
     """How far the prediction stays above the fit; ``x`` as for :func:`kernel_error`.
 
-    Largest where the nodes of a level are close: there the errors are below one per cent, and the
-    fit is up to a fifth too low.
+    It is largest where the nodes of a level are close: there the errors are below one per cent, and
+    the fit is up to a fifth too low.
     """
     return 1.06 + 0.5 * dr.clip(1.3 - x, 0, 0.4) if kernel == "gaussian" else 1.15
 
@@ -146,7 +146,7 @@ def true_masses(places, spacing: float, spread, bins: np.ndarray) -> np.ndarray:
 def table_masses(places, spacing: float, periods, count, variances, masses) -> np.ndarray:
     """The same from a level of ``count`` nodes (y, x) with the ``masses`` (nodes, bins).
 
-    ``variances`` (y, x; texels²): of the functions of its nodes.
+    ``variances`` (y, x; texels²): variances of the functions of its nodes.
     """
     from scipy.sparse import csr_matrix
 
@@ -180,7 +180,7 @@ def grains(periods, counts, variances, mixed, levels, spread, bins: np.ndarray) 
     Args:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
-        variances (list of pairs): of the nodes' functions, texels², for every level.
+        variances (list of pairs): variances of the nodes' functions, texels², for every level.
         mixed (list of bools): whether these are mixtures of finer splines.
         levels (list of arrays): masses (nodes, bins) of every level in ``bins``.
         spread: ``spread(row, column)`` returns the matrix (quads, all bins).

@@ -42,7 +42,7 @@ MIN_BIN = 1e-4
 #: Memory allowed for the finest level, bytes. All levels together take up to 3 times as much.
 BYTES = 64 << 20
 
-#: Share of it that is planned for: the need is estimated from a sample, up to 15 % too low.
+#: Share of this memory that is planned for: an estimate from a sample may be up to 15 % too low.
 PLANNED = 0.9
 
 #: Smallest distance of nodes, texels. Below, the exact lists are as fast.
@@ -118,9 +118,9 @@ def level_counts(count: tuple[int, int]) -> list[tuple[int, int]]:
 def weights_of(finer: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The splines of ``count`` nodes as sums of those of ``finer``: ``(finer nodes, weights)``.
 
-    Both (``count``, K). Where ``count`` divides ``finer``, a coarse spline is a sum of fine ones.
-    Two thirds as many nodes stand for what comes closest among positive weights that add up to one
-    for every fine spline and keep the mean: a function about as wide as the spline.
+    Both are (``count``, K). Where ``count`` divides ``finer``, a coarse spline is a sum of fine
+    ones. Two thirds as many nodes have a function about as wide as the spline: the closest one with
+    positive weights that add up to one for every fine spline and keep the mean.
     """
     node = np.arange(count)[:, None]
     if 3 * count == 2 * finer:
@@ -157,7 +157,7 @@ def variances_of(periods, count, finest) -> tuple[float, float]:
 
 
 def mixed_levels(counts) -> list[bool]:
-    """Of all levels, whether the functions of the nodes are mixtures of finer splines."""
+    """For every level, whether the functions of its nodes are mixtures of finer splines."""
     return [any(3 * n == 2 * f for n, f in zip(count, counts[0], strict=True)) for count in counts]
 
 
@@ -370,9 +370,10 @@ class NormalTables:
     Attributes:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
-        grains (nested lists): texels, of every level, kernel and knot.
+        grains (nested lists): grains of every level, kernel and knot, texels.
         mixed (list of bools): whether the functions of the nodes are mixtures of finer splines.
-        variances (list of pairs): of the functions of the nodes of every level (y, x), texels².
+        variances (list of pairs): variances (y, x) of the functions of every level's nodes,
+            texels².
         level_nbytes (list of int): memory of every level, bytes.
     """
 
@@ -583,7 +584,7 @@ def masses(periods, count, spread, per_quad: float, report) -> csr_matrix:
 
 
 def without_empty_rows(matrix: csr_matrix, filled: np.ndarray) -> csr_matrix:
-    """The rows ``filled`` of a matrix, all others being empty: a view."""
+    """The rows ``filled`` of a matrix, whose other rows are empty; a view."""
     from scipy.sparse import csr_matrix
 
     begin = np.append(matrix.indptr[filled], matrix.nnz)

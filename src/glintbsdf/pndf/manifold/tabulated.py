@@ -124,7 +124,7 @@ class TabulatedManifold(Manifold):
         return predicted(self.kernel, *nodes, tables.mixed[level], minor, mean)
 
     def measured_error(self, footprint) -> float:
-        """The relative L1 error under a single footprint, over all bins: a check, slow.
+        """The relative L1 error under a single footprint, over all bins: a slow check.
 
         The truth spreads every triangle over the bins, weighed by the kernel at its quad's centre.
         """
@@ -207,7 +207,7 @@ class TabulatedManifold(Manifold):
             self.normal_map.wrap_mode,
             tuple(added),
         )
-        # Texels have their centres on the corners of quads, nodes in the middle of theirs.
+        # Texels have their centres on the corners of quads, nodes in the middle of their cells.
         kernel.mean -= 0.5 * per_texel
         return kernel
 
@@ -288,13 +288,13 @@ class TabulatedManifold(Manifold):
         kernel, level = self.node_kernel(query), self.level(query)
         active = active & (level >= 0)
 
-        # More numbers than the two given are wanted: hashed from them.
+        # Sampling takes more numbers than the two given: the others are hashed from them.
         a, b = (dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y))
         randoms = [uniform(v) for stream in range(5) for v in pcg3d(a, b, mi.UInt32(stream))]
         choice, *of_nodes, l1, l2, bin_x, bin_y = randoms[:13]
 
         def pick(nodes, total, choice, at_y, at_x):
-            """Weighted reservoir of one, the random number being stretched and used again."""
+            """Weighted reservoir of one, which stretches the random number and uses it again."""
             for weight, y, x, active in nodes:
                 total = total + weight
                 chance = weight / dr.select(total > 0, total, 1)
