@@ -119,3 +119,36 @@ def test_derivative_inside_of_adapters(variant, adapter):
             "second": {"type": "diffuse"},
         }
     check_render_derivative(two_sided(outer), "sigma_r", "prb")
+
+
+@pytest.mark.parametrize("name, key", [("elements", "sigma_r"), ("manifold", "data")])
+def test_steps_of_an_optimisation_need_no_new_kernel(variant, name, key):
+    plate = {"type": "rectangle", "bsdf": two_sided(bsdf(name, masking="none"))}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "prb", "max_depth": 2},
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 4, "height": 4},
+            },
+            "plate": plate,
+            "light": {"type": "point", "position": [0.2, 0.1, 4], "intensity": 1.0},
+        }
+    )
+    params = mi.traverse(scene)
+    (name,) = (k for k in params.keys() if k.endswith("." + key))  # noqa: SIM118 (not a dict)
+    start = params[name] + 0
+    missed = []
+    for step in range(3):
+        params[name] = start * (1 + 0.01 * step)
+        dr.enable_grad(params[name])
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            params.update()
+            dr.backward(dr.mean(mi.render(scene, params, spp=4, seed=step), axis=None))
+            dr.eval(dr.grad(params[name]))
+            history = dr.kernel_history([dr.KernelType.JIT])
+        missed.append(sum(not kernel["cache_hit"] for kernel in history))
+    assert missed[2] == 0, missed

@@ -28,6 +28,16 @@ from glintbsdf.pndf.displaced import Displaced, DisplacedMasking
 from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
 
 
+class MakesOpaque:
+    """A callback of ``traverse`` that takes the values of parameters out of the code of kernels, so
+    that another value needs no other kernel. Zeros stay: what they switch off is left out."""
+
+    def put(self, name: str, value: object, flags: int) -> None:
+        """Called for every parameter, as ``mi.TraversalCallback.put`` is."""
+        if isinstance(value, mi.Float) and not is_literal_zero(value):
+            dr.make_opaque(value)
+
+
 class RefusesDerivatives:
     """A callback of ``traverse`` that raises :class:`~.ParameterError` where derivatives are asked
     for that there are none of: they would be zero without a word."""
@@ -100,6 +110,7 @@ class FootprintBSDF(mi.BSDF):
         callback.put("pixel_spread", self.pixel_spread, flags)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        self.traverse(MakesOpaque())
         if not keys or "to_uv" in keys:
             check_to_uv(self.owner, self.to_uv)
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):

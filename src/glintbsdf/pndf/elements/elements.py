@@ -374,6 +374,8 @@ class Elements(Mixture):
         self.data = mi.TensorXf(normal_map.normals) if data is None else data
         self.changed = data is not None
         self.sigma_r = mi.Float(sigma_r)
+        if self.changed:  # another map must not need another kernel
+            dr.make_opaque(self.sigma_r)
         self.build(domain)
 
     def build(self, domain: Domain | None = None) -> None:
