@@ -20,6 +20,7 @@ COMMANDS = (
     "cost",
     "manifold",
     "projected_area",
+    "energy",
     "mip",
     "grid",
     "separation",

@@ -43,8 +43,11 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
 
  * - masking
    - |string|
-   - Masking and shadowing: :monosp:`beckmann`, that of a Beckmann surface as rough as the whole map
-     or as the flakes, or :monosp:`none`. (Default: :monosp:`beckmann`)
+   - Masking and shadowing: :monosp:`footprint`, by the elements under the footprint, over the plane
+     of their mean slope, so that no place reflects more light than it receives; :monosp:`beckmann`,
+     the paper's, that of a level Beckmann surface as rough as the whole map or as the flakes, with
+     which a place that leans towards the viewer does; or :monosp:`none`.
+     (Default: :monosp:`footprint`)
 
  * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
@@ -64,7 +67,9 @@ where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\
 
 Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,
 and the lists of elements by normal, from which large footprints are evaluated, up to 96, or 42 with
-a :monosp:`step` of 1. The cost grows with the area of the footprint.
+a :monosp:`step` of 1.
+The moments of the slopes, from which large footprints are masked, take 10. The cost grows with the
+area of the footprint.
 
 The sum is cut where elements weigh little: 3 standard deviations from the footprint's centre, where
 they fade, and 3.94 from the mean of an element's normals. The integral of :math:`D` is one within
@@ -127,7 +132,7 @@ class GlintElements(GlintBSDF):
         parameters = Parameters(props)
         parameters.only_one_of(MAP_SOURCES, ("flake_density",))
         self.options = {"sigma_r": parameters.number("sigma_r", 0.005), "owner": self.owner}
-        self.masking_name = parameters.choice("masking", "beckmann", Elements.maskings)
+        self.masking_name = parameters.choice("masking", Elements.maskings[0], Elements.maskings)
         if "flake_density" in props:
             self.options |= {
                 "density": parameters.number("flake_density", 0.0),

@@ -32,8 +32,11 @@ Smooth filters of a normal map (:monosp:`glint_filtered`)
 
  * - masking
    - |string|
-   - Masking and shadowing: :monosp:`smith`, by the facets of the lobe, or :monosp:`none`. Part of
-     the method for :monosp:`leadr`, which takes no other. (Default: :monosp:`smith`)
+   - Masking and shadowing by the facets of the lobe: :monosp:`footprint`, over the mean facet,
+     LEADR's rule, for all methods; :monosp:`smith`, with the geometric surface in the reflection,
+     so that a footprint which leans towards the viewer reflects more light than it receives; or
+     :monosp:`none`. With :monosp:`leadr`, :monosp:`smith` is :monosp:`footprint`, and there is no
+     :monosp:`none`. (Default: :monosp:`footprint`)
 
  * - height_correlated
    - |bool|
@@ -58,8 +61,8 @@ a MIP chain that holds no more than the method needs:
     * - :monosp:`clean`
       - As LEAN, with one variance for all directions :cite:`Baker2011CLEAN`
     * - :monosp:`leadr`
-      - LEAN, with the masking and the projected area of its lobe :cite:`Dupuy2013LEADR`: never
-        reflects more light than arrives
+      - LEAN, with the masking and the projected area of its lobe :cite:`Dupuy2013LEADR`, which
+        here is the default for all of them: never reflects more light than arrives
     * - :monosp:`variance`
       - Roughness along u and v per MIP texel, from the variance lost there; what texture filtering
         between texels loses is not counted :cite:`RTR4`, section 9.13.1
@@ -123,12 +126,12 @@ class GlintFiltered(GlintBSDF):
             "max_anisotropy": parameters.number("max_anisotropy", 16.0),
             "owner": self.owner,
         }
-        self.masking_name = parameters.choice("masking", "smith", Filtered.maskings)
+        self.masking_name = parameters.choice("masking", Filtered.maskings[0], Filtered.maskings)
         check(
-            self.masking_name == "smith" or method != "leadr",
+            self.masking_name != "none" or method != "leadr",
             self.owner,
             "masking",
-            "smith for leadr, whose part it is",
+            "footprint for leadr, whose part it is",
             self.masking_name,
         )
         self.height_correlated = parameters.boolean("height_correlated", True)

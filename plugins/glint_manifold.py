@@ -56,10 +56,12 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
  * - masking
    - |string|
-   - Masking and shadowing by the projected area of the facets under the footprint:
-     :monosp:`ggx_fit`, that of the GGX surface that fits them best; :monosp:`analytic`, their own,
-     exact but many times slower, as every triangle under the footprint counts. Or
-     :monosp:`beckmann`, that of a Beckmann surface as rough as the whole map, or :monosp:`none`.
+   - Masking and shadowing by the projected area of the facets under the footprint, over the plane
+     of their mean slope, so that no place reflects more light than it receives: :monosp:`ggx_fit`,
+     that of the smooth surface with the facets' mean and variance of slopes; :monosp:`analytic`,
+     their own, exact but many times slower, as every triangle under the footprint counts. Or
+     :monosp:`beckmann`, that of a level Beckmann surface as rough as the whole map, with which a
+     place that leans towards the viewer reflects more than it receives, or :monosp:`none`.
      (Default: :monosp:`ggx_fit`)
 
  * - height_correlated
@@ -81,6 +83,14 @@ triangles in position × normal space, on which the P-NDF has a closed form, eva
 where :math:`u^*` is the place in triangle :math:`\Delta` whose normal is :math:`m`, :math:`k` the
 kernel around the footprint's centre :math:`x`, and :math:`J_\Delta` the Jacobian of the normals
 over the triangle. Sampling draws from exactly this density.
+
+The paper masks facets over the geometric surface. A footprint leans, though, and a plane hides
+nothing of itself. Here :math:`1 + \Lambda(\omega) = \max(P(\omega)/\bar P(\omega), 1)`, with
+:math:`P` the projected area of the facets and :math:`\bar P` that of their mean plane, which also
+takes the place of the cosine of the view in :math:`F D G / (4 \bar P(\omega_i))`, as in
+:cite:`Dupuy2013LEADR`. Other plugins with a map do the same. On a surface of slopes 0.15, at 0°,
+46° and 69°, places under footprints of some texels reflect on average what a ray traced height
+field does, within 2 %; at 83°, where it reflects 0.93, the rule gives 0.80 to 0.90.
 
 *Derivatives with respect to* :monosp:`data`. This density, at a fixed :math:`m`, jumps whenever an
 edge of a triangle moves across :math:`m`: automatic differentiation would see the change within

@@ -113,9 +113,8 @@ def test_extreme_roughness_is_finite(variant, sigma_r):
 @pytest.mark.parametrize("kind", ["curved", "flakes"])
 def test_furnace(variant, kind):
     bsdf = load(**KINDS[kind])
-    # Seen askew, a patch that leans towards the view reflects more than arrives on its base.
-    suite.check_furnace(bsdf, replace(VIEWS["small"], wi=(0, 0, 1)))
-    for wi in ((1, 0, 1), (0, 1, 0.3), (1, 1, 0.1)):
+    for wi in ((0, 0, 1), (1, 0, 1), (0, 1, 0.3), (1, 1, 0.1)):
+        suite.check_furnace(bsdf, replace(VIEWS["small"], wi=wi), count=2000)
         suite.check_furnace(bsdf, replace(EXTREME_VIEWS["one_map"], wi=wi), count=2000)
 
 
@@ -136,7 +135,7 @@ def test_derivatives(variant, kind, key):
 def test_masking_is_that_of_the_overall_roughness(variant):
     alpha = 0.25
     flakes = {"flake_density": 2000.0, "flake_alpha": alpha, "data": None}
-    masked, bare = load(**flakes), load(**flakes, masking="none")
+    masked, bare = (load(**flakes, masking=masking) for masking in ("beckmann", "none"))
     si, bs, _ = suite.sample(masked, replace(RESOLVED, wi=(1, 0.2, 0.4)), 500)
     ctx = mi.BSDFContext()
     ratio = masked.eval(ctx, si, bs.wo)[0] / bare.eval(ctx, si, bs.wo)[0]

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.footprint.query import Query
+from glintbsdf.microfacet.mean_plane import mean_plane_area, visibility
 
 
 class SmithMasking:
@@ -90,6 +91,38 @@ class BeckmannMasking(SmithMasking):
             f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
             f"height_correlated = {self.height_correlated}]"
         )
+
+
+class MeanPlaneMasking(SmithMasking):
+    """Masking of the facets under the footprint over their own mean plane.
+
+    See :mod:`glintbsdf.microfacet.mean_plane`: ``f cosθ_o = F D V/4``.
+
+    Args:
+        facets: what knows the facets under a footprint, by
+            ``projected_areas(directions, query, active)``: a :class:`~.PNDF`, say.
+        height_correlated: see :class:`SmithMasking`.
+        name: what it is called in print.
+    """
+
+    def __init__(self, facets, height_correlated: bool = True, name: str = "footprint") -> None:
+        super().__init__(height_correlated)
+        self.facets, self.name = facets, name
+
+    def eval(self, wi, wo, query, mode, active):
+        """The factor on F D/(4 cosθ_i), which may exceed 1: V cosθ_i.
+
+        Where importance is transported, light comes along ``wi`` and leaves for the viewer along
+        ``wo``. V is then that of the directions exchanged, and BRDF and cosines leave V cosθ_o.
+        """
+        (p_i, p_o), slope = self.facets.projected_areas([wi, wo], query, active)
+        plane_i, plane_o = (mean_plane_area(w, slope) for w in (wi, wo))
+        if mode == mi.TransportMode.Importance:
+            return wo.z * visibility(p_o, plane_o, p_i, plane_i, self.height_correlated)
+        return wi.z * visibility(p_i, plane_i, p_o, plane_o, self.height_correlated)
+
+    def __repr__(self) -> str:
+        return f"{self.name}[height_correlated = {self.height_correlated}]"
 
 
 def beckmann_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:

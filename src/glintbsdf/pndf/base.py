@@ -32,7 +32,7 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet.frame import normal_from_projection
-from glintbsdf.microfacet.masking import BeckmannMasking, SmithMasking
+from glintbsdf.microfacet.masking import BeckmannMasking, MeanPlaneMasking, SmithMasking
 
 
 class Colors(Protocol):
@@ -210,8 +210,12 @@ class PNDF(ABC):
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
         """Masking and shadowing by one of :attr:`maskings`; None for ``none``.
 
-        ``beckmann`` is the masking of a Beckmann surface as rough as all normals together.
+        ``footprint`` is the masking of the facets under the footprint over their mean plane, by
+        :meth:`projected_areas`; ``beckmann`` that of a Beckmann surface as rough as all normals
+        together.
         """
+        if name == "footprint":
+            return MeanPlaneMasking(self, height_correlated)
         if name == "beckmann":
             return BeckmannMasking(self.alpha_squared, height_correlated, self.roughness_keys)
         if name == "none":

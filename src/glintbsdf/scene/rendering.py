@@ -49,6 +49,7 @@ def load_scene(
     Dr.Jit gets a second thread where it has only one: Mitsuba would never return from reading an
     OpenEXR file.
     """
+    gc.collect()  # no BSDF of a former scene may go while Dr.Jit records all that are alive
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
     parameters = dict(parameters or {})

@@ -337,10 +337,11 @@ def test_extremes(variant, estimate):
         assert np.isfinite(value) and 0 <= value < 2
 
 
-def test_ggx_fit_of_two_facets(variant):
-    # Facets of slope ±s side by side have P = (|ω_z + s·ω| + |ω_z − s·ω|)/2, at grazing angles that
-    # of Ω = s sᵀ. The footprint is wide enough to see as much of one as of the other; the chain of
-    # averages sees the triangles between them as well, which are less steep.
+def test_fit_of_two_facets(variant):
+    # Facets of slope ±s side by side have P = (|ω_z + s·ω| + |ω_z − s·ω|)/2. The fit knows their
+    # variance alone, and at grazing angles takes slopes for evenly distributed: √3/4 of its root,
+    # where two facets have ½. The footprint is wide enough to see as much of one as of the other;
+    # the chain of averages sees the triangles between them as well, which are less steep.
     slope = np.array([0.3, 0.1])
     normals = np.where(np.arange(64)[:, None] // 32 == 0, slope, -slope) / np.sqrt(
         1 + slope @ slope
@@ -348,7 +349,7 @@ def test_ggx_fit_of_two_facets(variant):
     area = GgxFit(TexelMesh(NormalMap(np.broadcast_to(normals, (4, 64, 2)))))
     footprint = Footprint.isotropic(mi.Point2f(0.5, 0.5), 2.0)
     for phi in (0, 0.5, 1.2, 2.5):
-        expected = 0.5 * abs(slope @ [np.cos(phi), np.sin(phi)])
+        expected = np.sqrt(3) / 4 * abs(slope @ [np.cos(phi), np.sin(phi)])
         actual = area.eval(direction(np.pi / 2, phi), footprint)[0]
         assert actual == pytest.approx(expected, abs=0.01)
 
@@ -446,22 +447,48 @@ def together(views: list[View], lanes: int) -> mi.SurfaceInteraction3f:
     return si
 
 
-def test_smith_lambda(variant):
+def test_masking_is_that_over_the_mean_plane(variant):
     mesh = TexelMesh(MASKING_MAPS["rough"])
-    footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.1)
-    query = Query(footprint)
+    query = Query(Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.1))
+    radiance, importance = mi.TransportMode.Radiance, mi.TransportMode.Importance
     for area in (ProjectedArea(mesh), GgxFit(mesh)):
         correlated, separable = (ProjectedAreaMasking(area, flag) for flag in (True, False))
         wi, wo = direction(1.3, 0.4), direction(1.0, 2.0)
-        p_i, p_o = (area.eval(w, footprint)[0] for w in (wi, wo))
-        lambda_i, lambda_o = max(p_i / wi.z[0] - 1, 0), max(p_o / wo.z[0] - 1, 0)
-        assert lambda_i > 0.02
-        g = correlated.eval(wi, wo, query, mi.TransportMode.Radiance, True)[0]
-        assert g == pytest.approx(1 / (1 + lambda_i + lambda_o), rel=1e-5)
-        g = separable.eval(wi, wo, query, mi.TransportMode.Radiance, True)[0]
-        assert g == pytest.approx(1 / ((1 + lambda_i) * (1 + lambda_o)), rel=1e-5)
+        areas, slope = area.projected_areas([wi, wo], query, mi.Bool(True))
+        p_i, p_o = (p[0] for p in areas)
+        plane_i, plane_o = (w.z[0] + slope.x[0] * w.x[0] + slope.y[0] * w.y[0] for w in (wi, wo))
+        lambda_i, lambda_o = max(p_i / plane_i - 1, 0), max(p_o / plane_o - 1, 0)
+        assert lambda_i > 5e-3 and abs(plane_i / wi.z[0] - 1) > 0.02
+        g = correlated.eval(wi, wo, query, radiance, True)[0]
+        assert g == pytest.approx(wi.z[0] / plane_i / (1 + lambda_i + lambda_o), rel=1e-4)
+        g = separable.eval(wi, wo, query, radiance, True)[0]
+        assert g == pytest.approx(wi.z[0] / plane_i / ((1 + lambda_i) * (1 + lambda_o)), rel=1e-4)
+        g = separable.eval(wi, wo, query, importance, True)[0]
+        assert g == pytest.approx(wo.z[0] / plane_o / ((1 + lambda_i) * (1 + lambda_o)), rel=1e-4)
         for w in (mi.Vector3f(1, 0, 1e-7), mi.Vector3f(1, 0, 1e-30)):
-            assert 0 <= correlated.eval(w, wo, query, mi.TransportMode.Radiance, True)[0] <= 1
+            assert 0 <= correlated.eval(w, wo, query, radiance, True)[0] <= 1
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_masses_of_triangles(variant, kernel):
+    # The halves of all quads under a kernel have its mass, and each as much as points find there.
+    rng = np.random.default_rng(3)
+    for sigma in (0.02, 0.3, 1.0, 2.5):
+        axes = sigma * np.array([[1.0, 0.4], [-0.3, 0.8]]) / 64
+        footprint = Footprint(mi.Point2f(0.51, 0.48), *(mi.Vector2f(*a.tolist()) for a in axes))
+        seen = TexelMesh(maps.flat(64), kernel).texel_kernel(footprint)
+        reach = int(np.ceil(3 * 1.5 * sigma)) + 1
+        y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1) - [[0.37], [0.21]]
+        corner = mi.Vector2f(np.float32(x), np.float32(y))
+        masses = np.array(seen.masses_in_quad(corner), np.float64)
+        assert masses.sum() == pytest.approx(1, abs=3e-3)
+        u = np.float32(rng.random((2, 400_000)))
+        offset = np.array(seen.sample(mi.Point2f(u)), np.float64) + [[0.21], [0.37]]
+        cell = np.floor(offset).astype(int) + reach
+        lower = (offset - np.floor(offset)).sum(axis=0) > 1
+        found = np.zeros((2, 2 * reach + 1, 2 * reach + 1))
+        np.add.at(found, (lower.astype(int), cell[1], cell[0]), 1 / u.shape[1])
+        assert np.allclose(found.reshape(2, -1), masses, atol=4e-3)
 
 
 @pytest.mark.parametrize("masking", ["analytic", "ggx_fit"])
@@ -490,7 +517,7 @@ def test_derivative_is_that_of_the_value(variant):
         def value(t, estimate=estimate):
             mesh = TexelMesh(normal_map, epsilon=1e-9)
             mesh.data = mi.TensorXf(normal_map.normals) + t * mi.TensorXf(step)
-            mesh.build()
+            mesh.make_vertices()
             return estimate(mesh).eval(w, footprint)
 
         t = mi.Float(0)
@@ -514,7 +541,7 @@ def test_analytic_masking_of_approximate_pndfs(variant, parameters):
     _, same, more = suite.sample(unmasked, view, 100)
     assert dr.allclose(bs.wo, same.wo) and dr.any(bs.pdf > 0)
     area = ProjectedArea(TexelMesh(normal_map))
-    footprint = Footprint(si.uv, si.duv_dx, si.duv_dy)
-    g = ProjectedAreaMasking(area, False).eval(si.wi, bs.wo, footprint, bs.pdf > 0)
+    query = Query(Footprint(si.uv, si.duv_dx, si.duv_dy))
+    g = ProjectedAreaMasking(area, False).eval(si.wi, bs.wo, query, mi.TransportMode.Radiance, True)
     assert dr.allclose(weight, dr.select(bs.pdf > 0, more * g, 0), rtol=1e-4)
-    assert dr.mean(g)[0] < 0.999
+    assert dr.mean(dr.abs(g - 1))[0] > 1e-3

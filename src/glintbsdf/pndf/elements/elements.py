@@ -30,10 +30,23 @@ from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap, map_bytes
+from glintbsdf.microfacet.masking import SmithMasking
+from glintbsdf.microfacet.mean_plane import (
+    area_of_moments,
+    choose_areas,
+    lobe_area,
+    slope_along,
+    slope_of,
+    variance_along,
+)
 from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.filters.filters import COVARIANCE
+from glintbsdf.pndf.filters.moments import MomentPyramid, level_sigma
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
+from glintbsdf.pndf.manifold.mesh import frame_in_quad
+from glintbsdf.pndf.manifold.projected_area import mean_over_points
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
@@ -50,6 +63,10 @@ MAX_SEEDS = 4
 #: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
 #: takes 430 of its 1120 MB then at a step of half a texel, and 170 at one texel.
 BYTES_PER_CELL = 42, 96
+
+#: Finest level of the chain of the slopes' moments, which then takes a tenth of the lists. Narrower
+#: footprints are seen by points of the map.
+FIRST_LEVEL = 7
 
 #: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
 MAX_ATTEMPTS = 128
@@ -154,6 +171,12 @@ class Mixture(PNDF):
     element_bytes: int
     wrap_mode: str
 
+    maskings = ("footprint", "beckmann", "none")
+
+    #: The slopes' moments, and whether masking asks for them.
+    slopes: MomentPyramid | None = None
+    masked = False
+
     #: ρ² of the cut where the footprint is a point: its elements are interpolated there, and the
     #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
     point_cut = 4.0
@@ -161,12 +184,13 @@ class Mixture(PNDF):
     #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
     origin: tuple[float, ...] = (0.0, 0.0)
 
-    def seen(self, kernel: TexelKernel) -> Callable:
-        """What the footprint makes of elements, as a function ``(m, row, column, corner, active)``.
+    def lobes(self, kernel: TexelKernel) -> Callable:
+        """What the footprint makes of elements, as a function ``(row, column, corner, active)``.
 
         It lists the elements of a stored cell, whose ``corner`` is given from the footprint's
-        centre (cells): of each its area (cells), ρ² of its place, the peak of its normals'
-        density, and the squared Mahalanobis distance of the projected normal ``m`` from them.
+        centre (cells): of each its area (cells), ρ² of its place, and of its normals a projected
+        normal, how far their mean is from there (None for not at all), and their
+        :class:`~.Gaussian`.
         """
         raise NotImplementedError
 
@@ -214,6 +238,63 @@ class Mixture(PNDF):
         kernel.cut_at(dr.sqrt(cut))
         return kernel, few, cut
 
+    def projected_areas(self, directions, query, active):
+        """Those of the elements, each with its own; of large footprints by the slopes' moments."""
+        kernel, few, cut = self.weights(query)
+        lobes = self.lobes(kernel)
+
+        def add(sums, *cell):
+            mass, slope, *areas = sums
+            for area, near, normal, shift, normals in lobes(*cell):
+                weight = area * dr.clip((cut - near) * (1 / FADE), 0, 1) * dr.exp(-0.5 * near)
+                weight = dr.select(cell[-1], weight, 0)
+                mean = mi.Vector2f(normal if shift is None else normal + shift)
+                mass, slope = mass + weight, slope + weight * slope_of(mean)
+                areas = [
+                    dr.fma(weight, lobe_area(w, mean, normals.vectors, normals.variance), total)
+                    for w, total in zip(directions, areas, strict=True)
+                ]
+            return mass, slope, *areas
+
+        zero = (mi.Float(0), mi.Vector2f(0), *(mi.Float(0) for _ in directions))
+        mass, slope, *areas = self.sum_all(kernel, add, active & few, zero)
+        inverse = dr.rcp(dr.select(mass > 0, mass, 1))
+        summed = [area * inverse for area in areas], slope * inverse
+        if self.slopes is None:
+            return summed
+        return choose_areas(few, summed, self.areas_of_many(directions, query, active & ~few))
+
+    def areas_of_many(self, directions: list, query: Query, active: mi.Bool) -> tuple:
+        """``(areas, mean slope)`` of a large footprint, by averages of the slopes' moments."""
+        slope, covariance = self.slope_moments(query, active)
+        turned = 1 + dr.squared_norm(slope)  # as the intrinsic roughness widens with the slope
+        rough = dr.square(self.sigma_r) * turned
+        xx, xy, yy = covariance
+        covariance = (
+            dr.fma(rough, 1 + slope.x * slope.x, xx),
+            dr.fma(rough, slope.x * slope.y, xy),
+            dr.fma(rough, 1 + slope.y * slope.y, yy),
+        )
+        areas = [
+            area_of_moments(slope_along(w, slope), variance_along(w, covariance))
+            for w in directions
+        ]
+        return areas, slope
+
+    def slope_moments(self, query: Query, active: mi.Bool) -> tuple[mi.Vector2f, tuple]:
+        """Mean of the map's slopes under a large footprint, and their covariance (xx, xy, yy)."""
+        raise NotImplementedError
+
+    def make_slopes(self) -> MomentPyramid | None:
+        """What :meth:`slope_moments` looks up; None where no footprint is large."""
+        raise NotImplementedError
+
+    def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
+        self.masked = name == "footprint"
+        if self.masked:
+            self.slopes = self.make_slopes()
+        return super().masking(name, height_correlated)
+
     def overlap(self, kernel: TexelKernel) -> Overlap:
         """What the footprint sees of every element."""
         return Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=self.variance))
@@ -221,22 +302,29 @@ class Mixture(PNDF):
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it."""
         kernel, few, cut = self.weights(query)
-        seen = self.seen(kernel)
+        lobes = self.lobes(kernel)
         active = active & (dr.squared_norm(m) < 1)
+
+        def seen(*cell):
+            # Of each element its area, ρ², the peak of its normals' density, and the squared
+            # Mahalanobis distance of m from them.
+            for area, near, normal, shift, normals in lobes(*cell):
+                delta = m - normal if shift is None else m - normal - shift
+                yield area, near, normals.peak, normals.distance_squared(delta)
 
         def share(area, near):
             return area * dr.clip((cut - near) * (1 / FADE), 0, 1)
 
         def add(density, *cell):
             total = mi.Float(0)
-            for area, near, peak, alike in seen(m, *cell):
+            for area, near, peak, alike in seen(*cell):
                 weight = share(area, near) * peak
                 total = dr.fma(weight, dr.exp(-0.5 * (near + alike)), total)
             return density + dr.select(cell[-1], total, 0)
 
         def add_both(sums, *cell):
             total = mi.Vector2f(0)
-            for area, near, peak, alike in seen(m, *cell):
+            for area, near, peak, alike in seen(*cell):
                 weight = share(area, near) * dr.exp(-0.5 * near)
                 total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * alike), weight)
             return sums + dr.select(cell[-1], total, 0)
@@ -305,7 +393,12 @@ class Mixture(PNDF):
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
         lists = 0 if self.lists is None else self.lists.nbytes
-        return {"elements": self.element_bytes, "lists of elements": lists}
+        parts = {"elements": self.element_bytes, "lists of elements": lists}
+        if self.slopes is not None:
+            parts[f"masking, MIP levels {self.slopes.first} to {self.slopes.top}"] = (
+                self.slopes.nbytes
+            )
+        return parts
 
 
 def draw_neighbour(x, random):
@@ -412,6 +505,42 @@ class Elements(Mixture):
         if domain is None or not self.all_small(domain.largest):
             arrays = self.cached(self.build_lists, self.sigma_r[0], self.step, self.curved)
             self.lists = QuadLists(self.lattice, arrays)
+        self.slopes = self.make_slopes() if self.masked else None
+
+    def make_slopes(self) -> MomentPyramid | None:
+        if self.lists is None:
+            return None
+        return MomentPyramid(
+            self.data,
+            self.wrap_mode,
+            lambda m: list(slope_of(m)),
+            spread=COVARIANCE,
+            first=FIRST_LEVEL,
+            domain=self.domain,
+        )
+
+    def slope_moments(self, query, active):
+        x, y, xx, yy, xy = self.slopes.average(query, active)
+        return mi.Vector2f(x, y), (xx, xy, yy)
+
+    def areas_of_many(self, directions, query, active):
+        """Where the chain of moments is too coarse, by points of the map."""
+        height, width, _ = self.data.shape
+        kernel = query.texel_kernel("gaussian", height, width, self.wrap_mode)
+        narrow = kernel.minor_variance < level_sigma(FIRST_LEVEL) ** 2
+        points = mean_over_points(
+            self, kernel, directions, active & narrow, False, dr.square(self.sigma_r)
+        )
+        averages = super().areas_of_many(directions, query, active & ~narrow)
+        return choose_areas(narrow, points, averages)
+
+    def frame_at(self, u: mi.Point2f, active: mi.Bool) -> tuple:
+        """The map's projected normal at a place (texels), and its derivatives, as
+        :meth:`.TexelMesh.frame_at`."""
+        column, row = floor_int(u.x), floor_int(u.y)
+        rows, columns = self.texels.y, self.texels.x
+        normals = self.corner_normals(rows.locate(row)[1], columns.locate(column)[1], active)
+        return frame_in_quad(u.x - column, u.y - row, normals, 0.0)
 
     def all_small(self, sigma: float) -> bool:
         """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
@@ -467,7 +596,7 @@ class Elements(Mixture):
             return [(normal_at(normals, *place), None) for place in self.places]
         return [(normals[ANCHORS[side][1]], jacobians[side]) for side in sides]
 
-    def seen(self, kernel):
+    def lobes(self, kernel):
         roughness = Gaussian(variance=dr.square(self.sigma_r))
         overlap = self.overlap(kernel)
         area = 1 / len(self.places)
@@ -478,20 +607,20 @@ class Elements(Mixture):
             for place, anchor in zip(self.places, self.anchors, strict=True)
         ]
 
-        def seen(m, row, column, corner, active):
+        def lobes(row, column, corner, active):
             white_corner, step = kernel.whitened(corner), overlap.gain @ corner
             distribution, of = roughness, None
             for k, (normal, jacobian) in enumerate(self.elements(row, column, active)):
-                delta = m - normal
+                shift = None
                 if jacobian is not None:
-                    # m − (s_i + J μ): the normal is that of the anchor, and μ = −S T⁻¹ offset.
-                    delta = delta + jacobian @ (step + steps[k])
+                    # s_i + J μ: the normal is that of the anchor, and μ = −S T⁻¹ offset.
+                    shift = -(jacobian @ (step + steps[k]))
                     if jacobian is not of:
                         distribution, of = overlap.normals(jacobian, roughness), jacobian
                 near = dr.squared_norm(white_corner + whitened[k])
-                yield area, near, distribution.peak, distribution.distance_squared(delta)
+                yield area, near, normal, shift, distribution
 
-        return seen
+        return lobes
 
     def is_small(self, kernel, steps):
         return kernel.touched_quads() <= tuning().few_cells

@@ -15,11 +15,16 @@ from glintbsdf.core.errors import ParameterError, check, check_whole
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice
 from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
+from glintbsdf.microfacet.mean_plane import slope_of
 from glintbsdf.pndf.base import register
 from glintbsdf.pndf.elements.elements import NORMAL_REACH, Mixture, check_sigma_r
+from glintbsdf.pndf.filters.moments import MomentPyramid
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import SHIFT, Builder, QuadLists
+
+#: Finest level of the chain of the slopes' moments: its Gaussian is as wide as those footprints.
+FIRST_LEVEL = 8
 
 #: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
 #: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
@@ -175,6 +180,7 @@ class Flakes(Mixture):
         self.lists = QuadLists(self.lattice, self.cached(build_lists, *key))
         # With a single cell of normals: all flakes, block by block.
         self.all = QuadLists(self.lattice, build_lists(0))
+        self.slopes = self.make_slopes() if self.masked else None
 
     def index(self, row, column):
         return mi.UInt32(row * self.map_cells[0] + column)
@@ -186,16 +192,31 @@ class Flakes(Mixture):
         )
         return mi.Vector2f(x, y), mi.Vector2f(normal_x, normal_y)
 
-    def seen(self, kernel):
+    def lobes(self, kernel):
         roughness = Gaussian(variance=dr.square(self.sigma_r))
 
-        def seen(m, row, column, corner, active):
+        def lobes(row, column, corner, active):
             place, normal = self.flake(row, column, active)
             area = dr.gather(mi.Float, self.areas, self.index(row, column), active)
             near = dr.squared_norm(kernel.whitened(corner + place))
-            yield area, near, roughness.peak, roughness.distance_squared(m - normal)
+            yield area, near, normal, None, roughness
 
-        return seen
+        return lobes
+
+    def make_slopes(self) -> MomentPyramid:
+        """Sums of the flakes' slopes and their products, by cells; a mean cell has the area 1."""
+        n = self.map_cells[0]
+        index = dr.arange(mi.UInt32, n * n)
+        normal = self.flake(index // n, index % n, True)[1]
+        slope, mean_area = slope_of(normal), dr.mean(self.areas)
+        x, y = slope * (self.areas / mean_area)
+        records = [x, y, x * slope.x, x * slope.y, y * slope.y]
+        shape = dr.zeros(mi.TensorXf, (n, n, 2))
+        return MomentPyramid(shape, "repeat", None, first=FIRST_LEVEL, records=records)
+
+    def slope_moments(self, query, active):
+        x, y, xx, xy, yy = self.slopes.average(query, active)
+        return mi.Vector2f(x, y), (xx - x * x, xy - x * y, yy - y * y)
 
     def is_small(self, kernel, steps):
         return steps < EVEN

@@ -23,6 +23,7 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels, map_bytes
 from glintbsdf.microfacet.masking import SmithMasking
+from glintbsdf.microfacet.mean_plane import mean_plane_area, visibility
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
@@ -189,7 +190,7 @@ class Filtered(PNDF):
 
     normal_map: NormalMap
 
-    maskings = ("smith", "none")
+    maskings = ("footprint", "smith", "none")
 
     def __init__(
         self,
@@ -281,11 +282,16 @@ class Filtered(PNDF):
     def visible_pdf(self, wi, m, density, query, active):
         return self.lobe(query).visible_pdf(wi, m, density)
 
+    def projected_areas(self, directions, query, active):
+        """Those of the lobe."""
+        lobe = self.lobe(query)
+        return [lobe.visible_area(w) for w in directions], lobe.mean
+
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
-        """``smith``: that of the lobe's facets about its mean facet; LEADR's projects as well."""
-        if name != "smith":
-            return super().masking(name, height_correlated)
-        return LobeMasking(self, height_correlated, projection=self.name == "leadr")
+        """``footprint``: LEADR's, for every lobe. ``smith``: without LEADR's projection."""
+        if name == "smith" and self.name != "leadr":
+            return LobeMasking(self, height_correlated)
+        return super().masking("footprint" if name == "smith" else name, height_correlated)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
@@ -316,56 +322,30 @@ class Filtered(PNDF):
 
 
 # ------------------------------------------------------------------------------------------------
-#  In the microfacet frame
+#  Masking as it was before the mean plane took the surface's place
 # ------------------------------------------------------------------------------------------------
 
 
 class LobeMasking(SmithMasking):
-    """Smith's masking and shadowing by the facets of a lobe about its mean facet.
+    """Smith's masking by the facets of a lobe, in the reflection of the geometric surface.
 
-    ``Λ = P/A − 1`` with A the area of the mean facet seen, P that of all facets that face the
-    direction (``slope_lobe.py``); 0 where the mean facet faces away. With ``projection`` the
-    reflection is that of the mean facet, not of the geometric surface: ``cosθ_i`` in the
-    denominator of the BRDF becomes A (Dupuy et al. 2013). No more light is reflected
-    then than arrives, whatever the mean slope.
+    Λ = P/P̄ − 1 is that of the lobe about its mean facet, but ``cosθ_i`` stays in the denominator of
+    the BRDF: a footprint that leans towards the viewer reflects more than it receives, one that
+    leans away less. 0 where the mean facet faces away from the viewer or the light.
 
     Args:
         pndf (Filtered): whose lobe.
-        height_correlated: see :class:`SmithMasking`.
-        projection (bool): LEADR's.
+        height_correlated: see :class:`~.SmithMasking`.
     """
 
-    def __init__(
-        self, pndf: Filtered, height_correlated: bool = True, projection: bool = False
-    ) -> None:
+    def __init__(self, pndf: Filtered, height_correlated: bool = True) -> None:
         super().__init__(height_correlated)
-        self.pndf, self.projection = pndf, projection
+        self.pndf = pndf
 
-    def smith_lambda(self, w: mi.Vector3f, query: Query, active: mi.Bool) -> mi.Float:
-        lobe = self.pndf.lobe(query)
-        mean = lobe.mean_cosine(w)
-        facing = mean > 0
-        ratio = lobe.visible_area(w) / dr.select(facing, mean, 1)
-        return dr.select(facing, dr.maximum(ratio - 1, 0), 0)
-
-    def eval(
-        self,
-        wi: mi.Vector3f,
-        wo: mi.Vector3f,
-        query: Query,
-        mode: mi.TransportMode,
-        active: mi.Bool,
-    ) -> mi.Float:
-        lobe = self.pndf.lobe(query)
-        mean_i, mean_o = lobe.mean_cosine(wi), lobe.mean_cosine(wo)
-        facing = (mean_i > 0) & (mean_o > 0)
-        value = super().eval(wi, wo, query, mode, active)
-        if self.projection:
-            value = value * wi.z / dr.select(facing, mean_i, 1)
-        return dr.select(facing, value, 0)
+    def eval(self, wi, wo, query, mode, active):
+        (p_i, p_o), slope = self.pndf.projected_areas([wi, wo], query, active)
+        plane_i, plane_o = (mean_plane_area(w, slope) for w in (wi, wo))
+        return plane_i * visibility(p_i, plane_i, p_o, plane_o, self.height_correlated)
 
     def __repr__(self) -> str:
-        return (
-            f"smith[height_correlated = {self.height_correlated}"
-            f"{', projection' if self.projection else ''}]"
-        )
+        return f"smith[height_correlated = {self.height_correlated}]"

@@ -86,6 +86,10 @@ class HandOver(PNDF):
     def smooth(self) -> PNDF | None:
         return self.near.smooth()
 
+    def projected_areas(self, directions, query, active):
+        """Those of the map's facets, which the lobe has as well."""
+        return self.near.projected_areas(directions, query, active)
+
     def masking(self, name: str, height_correlated: bool = True):
         return self.near.masking(name, height_correlated)
 

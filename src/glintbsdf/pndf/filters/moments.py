@@ -387,6 +387,10 @@ class MomentPyramid:
         max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
         over_quad: function of the normals at the corners of a quad that returns the averages over
             it; by default that of ``moments`` by :func:`midpoint_rule`.
+        first (int): the finest level; by default the texels, or 1 without them. A footprint that is
+            narrower is widened.
+        records: what is averaged, of each texel of a map that repeats, instead of ``over_quad``:
+            one ``mi.Float`` of H·W numbers per channel.
         domain (Domain): what will be asked for; levels and parts of levels that no such footprint
             needs are left out. What lies within the domain has the same averages to the last bit.
 
@@ -406,6 +410,8 @@ class MomentPyramid:
         domain: Domain | None = None,
         spread: Spread = (),
         between: bool = True,
+        first: int | None = None,
+        records: list | None = None,
     ) -> None:
         self.spread = spread if between else ()
         self.height, self.width, _ = data.shape
@@ -416,7 +422,7 @@ class MomentPyramid:
             SampleAxis(rows, 0.0, 1.0, self.periodic),
             SampleAxis(columns, 0.0, 1.0, self.periodic),
         )
-        self.first = 0 if moments is not None else 1
+        self.first = (0 if moments is not None else 1) if first is None else first
         self.top = self.first + 1
         while max(rows, columns) > level_sigma(self.top):
             self.top += 1
@@ -440,9 +446,11 @@ class MomentPyramid:
 
         if self.first == 0:
             keep(record_of(moments, spread, all_texels(normals, texels, axes_of(0))))
-        over_quad = over_quad or partial(midpoint_rule, moments, spread)
-        level, axes = quad_averages(over_quad, normals, texels)
-        variance = 1 / 12  # of a quad, along each axis
+        level, axes = records, texels
+        if records is None:
+            over_quad = over_quad or partial(midpoint_rule, moments, spread)
+            level, axes = quad_averages(over_quad, normals, texels)
+        variance = 1 / 12  # of a quad or a texel, along each axis
         for number in range(1, self.top + 1):
             sigma, target = level_sigma(number), axes_of(number)
             for along in (0, 1):

@@ -13,10 +13,11 @@ import mitsuba as mi
 
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.query import Query
+from glintbsdf.microfacet.mean_plane import slope_of
 from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.filters.moments import MomentPyramid
 from glintbsdf.pndf.manifold.mesh import TexelMesh
-from glintbsdf.pndf.manifold.projected_area import LOWEST, ProjectedArea
+from glintbsdf.pndf.manifold.projected_area import ProjectedArea
 
 
 class FacetDiffuse:
@@ -134,7 +135,7 @@ class OrenNayarDiffuse:
 
 def slope_moments(m: mi.Vector2f) -> list:
     """Projected normal, slope, and squared slope of a facet."""
-    slope = m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
+    slope = slope_of(m)
     return [m.x, m.y, slope.x, slope.y, dr.squared_norm(slope)]
 
 

@@ -52,6 +52,7 @@ class Manifold(TexelMesh, PNDF):
     """
 
     normal_map: NormalMap
+    area: projected_area.ProjectedArea | None = None
 
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
@@ -70,7 +71,7 @@ class Manifold(TexelMesh, PNDF):
     def build(self, domain: Domain | None = None) -> None:
         """Make the lists of what queries within ``domain`` need; the cache may know them."""
         self.domain = domain
-        self.lists, self.stand_in = None, None
+        self.lists, self.area, self.stand_in = None, None, None
         if dr.grad_enabled(self.data):
             spread = float(np.mean(np.var(self.normal_map.normals, axis=(0, 1)))) ** 0.5
             roughness = max(ROUGHNESS * spread, MIN_ROUGHNESS)
@@ -176,10 +177,18 @@ class Manifold(TexelMesh, PNDF):
         return SmoothBeckmann(lambda: smooth_alpha(self.alpha_squared()), owner=self.owner)
 
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
+        """``ggx_fit`` and ``analytic``: that of the facets under the footprint over their mean
+        plane, by either estimate of their projected area."""
         area = projected_area.area(name, self, self.domain)
         if area is None:
             return super().masking(name, height_correlated)
         return projected_area.ProjectedAreaMasking(area, height_correlated)
+
+    def projected_areas(self, directions, query, active):
+        """Those of the triangles. The first call must not be part of a recording."""
+        if self.area is None:
+            self.area = projected_area.ProjectedArea(self)
+        return self.area.projected_areas(directions, query, active)
 
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""

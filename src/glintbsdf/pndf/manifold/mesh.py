@@ -41,6 +41,13 @@ def equilateral(epsilon):
     return (0, r), (-sqrt(0.75) * r, -1.5 * r), (sqrt(0.75) * r, -1.5 * r)
 
 
+def is_degenerate(a, diagonal, epsilon):
+    """Whether a triangle has |det J| < ε; arguments are those of :func:`effective_triangle`."""
+    n1, n2 = diagonal
+    # To the last digit the determinant of quad_density, so that both find the same ones degenerate.
+    return dr.abs(cross(n2 - n1, a - n1)) < epsilon
+
+
 def effective_triangle(a, b, c, diagonal, epsilon):
     """The normal triangle n(Δ) on which sampling, evaluation and all bounds agree.
 
@@ -50,8 +57,7 @@ def effective_triangle(a, b, c, diagonal, epsilon):
     """
     n1, n2 = diagonal
     e1, e2, centre = b - a, c - a, 0.5 * (n1 + n2)
-    # To the last digit the determinant of quad_density, so that both find the same ones degenerate.
-    tiny = dr.abs(cross(n2 - n1, a - n1)) < epsilon
+    tiny = is_degenerate(a, diagonal, epsilon)
     small_a, small_e1, small_e2 = (mi.Vector2f(*v) for v in equilateral(epsilon))
     return (
         dr.select(tiny, centre + small_a, a),
@@ -75,19 +81,18 @@ def normal_in_quad(l1, l2, normals, epsilon):
 
 
 def frame_in_quad(l1, l2, normals, epsilon):
-    """As :func:`normal_in_quad`, and the columns of the Jacobian J(u): ``(n, ∂n/∂l1, ∂n/∂l2)``."""
+    """As :func:`normal_in_quad`, the columns of the Jacobian J(u), and whether the triangle there
+    is a replaced one: ``(n, ∂n/∂l1, ∂n/∂l2, degenerate)``."""
     n0, n1, n2, n3 = normals
     upper = l1 + l2 < 1
     l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
+    first = dr.select(upper, n0, n3)
     a, e1, e2 = effective_triangle(
-        dr.select(upper, n0, n3),
-        dr.select(upper, n1, n2),
-        dr.select(upper, n2, n1),
-        (n1, n2),
-        epsilon,
+        first, dr.select(upper, n1, n2), dr.select(upper, n2, n1), (n1, n2), epsilon
     )
     sign = dr.select(upper, mi.Float(1), -1)
-    return a + e1 * l1 + e2 * l2, e1 * sign, e2 * sign
+    degenerate = is_degenerate(first, (n1, n2), epsilon)
+    return a + e1 * l1 + e2 * l2, e1 * sign, e2 * sign, degenerate
 
 
 # ------------------------------------------------------------------------------------------------
@@ -105,6 +110,14 @@ def add_where(density, condition, added, active):
     return dr.if_stmt(
         (density,), active & condition, lambda density: density + added(), lambda density: density
     )
+
+
+def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
+    """``added(*sums)`` in the lanes that need it, in a branch; with derivatives, in all, as
+    :func:`add_where` does."""
+    if dr.grad_enabled(added(*sums)):
+        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
+    return dr.if_stmt(sums, needed, added, lambda *sums: sums)
 
 
 def quad_density(m, corner, kernel, normals, epsilon, active):
@@ -220,7 +233,7 @@ class TexelMesh:
         return self.frame_at(u, active)[0]
 
     def frame_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> tuple:
-        """As :meth:`normal_at`, and the columns of the Jacobian J(u): ``(n, ∂n/∂u_x, ∂n/∂u_y)``."""
+        """As :meth:`normal_at`, and what :func:`frame_in_quad` tells besides."""
         column, row = floor_int(u.x), floor_int(u.y)
         l1, l2 = u.x - column, u.y - row
         n0, n1, n2, n3 = self.quad_normals(

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from math import exp, inf, sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -45,18 +46,35 @@ from glintbsdf.core.hashing import pcg3d
 from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import TexelKernel, difference_of_products
+from glintbsdf.footprint.kernels import REACH, TexelKernel, difference_of_products
 from glintbsdf.footprint.lattice import Lattice, floor_int
 from glintbsdf.footprint.query import Query
-from glintbsdf.microfacet.masking import SmithMasking
+from glintbsdf.microfacet.masking import MeanPlaneMasking
+from glintbsdf.microfacet.mean_plane import (
+    area_of_moments,
+    choose_areas,
+    ggx_area,
+    gradient_along,
+    height_of,
+    slope_along,
+    slope_of,
+    variance_along,
+)
+from glintbsdf.pndf.filters.filters import COVARIANCE
 from glintbsdf.pndf.filters.moments import MomentPyramid
-from glintbsdf.pndf.manifold.mesh import TexelMesh, add_where, cross, triangles_of_quad
+from glintbsdf.pndf.index.lists import every_quad
+from glintbsdf.pndf.manifold.mesh import (
+    TexelMesh,
+    add_where,
+    cross,
+    is_degenerate,
+    normal_in_quad,
+    triangles_of_quad,
+    where_needed,
+)
 
 #: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
 HORIZON = 1e-15
-
-#: Lowest height of a normal that counts in a slope: of a vertical facet it would be infinite.
-LOWEST = 1e-3
 
 # ------------------------------------------------------------------------------------------------
 #  A triangle that is visible as a whole
@@ -348,7 +366,7 @@ class FootprintArea:
     """
 
     mesh: TexelMesh
-    few: int
+    few: float
 
     def eval(
         self, w: mi.Vector3f, query: Query | Footprint, active: bool | mi.Bool = True
@@ -357,10 +375,13 @@ class FootprintArea:
 
         ``query``: a query, or just a footprint in the UV space of the map.
         """
-        return self.areas([w], Query.of(query), mi.Bool(active))[0]
+        return self.projected_areas([w], Query.of(query), mi.Bool(active))[0][0]
 
-    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
-        """As :meth:`eval` for several directions, which share what is found under the footprint."""
+    def projected_areas(
+        self, directions: list, query: Query, active: mi.Bool
+    ) -> tuple[list, mi.Vector2f]:
+        """``(areas, mean slope)``: as :meth:`eval` for several directions, which share what is
+        found under the footprint; and the mean of m_xy/m_z."""
         raise NotImplementedError
 
     def parts(self) -> dict[str, int]:
@@ -389,8 +410,10 @@ class ProjectedArea(FootprintArea):
         self.mesh = mesh
         self.parameters_changed()
 
-    def parameters_changed(self) -> None:
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Choose the quadrature for the data of the mesh."""
+        if keys and "data" not in keys:
+            return
         with dr.suspend_grad():
             lattice = self.mesh.lattice
             index = dr.arange(mi.UInt32, lattice.x.quads * lattice.y.quads)
@@ -404,26 +427,27 @@ class ProjectedArea(FootprintArea):
                     longest = dr.maximum(longest, chord)
             longest = float(dr.max(longest)[0]) ** 0.5
         self.order = next(order for limit, order in ORDERS if longest <= limit)
+        self.jumps = has_degenerate_triangles(self.mesh)
 
     def triangles(self, row, column, active):
         """The effective triangles of a stored quad, each as first corner and two edges."""
         return triangles_of_quad(self.mesh.quad_normals(row, column, active), self.mesh.epsilon)
 
-    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
+    def projected_areas(self, directions, query, active):
         kernel = self.mesh.texel_kernel(query)
         few = kernel.touched_quads() <= self.few
-        by_points = mean_over_points(self.mesh, kernel, directions, active & few)
+        by_points = mean_over_points(self.mesh, kernel, directions, active & few, self.jumps)
         by_triangles = self.mean_over_triangles(directions, kernel, active & ~few)
-        return [dr.select(few, *pair) for pair in zip(by_points, by_triangles, strict=True)]
+        return choose_areas(few, by_points, by_triangles)
 
     def __repr__(self) -> str:
         return "analytic"
 
     def mean_over_triangles(self, directions, kernel, active):
-        """The weighted mean over the triangles of Eq. 12, for each direction."""
+        """The weighted mean over the triangles of Eq. 12, for each direction, and of the slope."""
         mean = mi.Vector2f(kernel.mean)
 
-        def add(x, y, row, column, active, mass, *areas):
+        def add(x, y, row, column, active, mass, slope, *areas):
             corner = mi.Vector2f(x, y) - mean
             triangles = self.triangles(row, column, active)
             for triangle, centroid in zip(triangles, (1 / 3, 2 / 3), strict=True):
@@ -431,13 +455,14 @@ class ProjectedArea(FootprintArea):
                 counts = active & (weight > 0)
                 seen = [self.triangle(triangle, w, counts) for w in directions]
                 areas = [dr.fma(weight, x, area) for x, area in zip(seen, areas, strict=True)]
+                slope = slope + weight * mean_slope(*triangle)
                 mass += weight
-            return mass, *areas
+            return mass, slope, *areas
 
-        sums = [mi.Float(0) for _ in range(1 + len(directions))]
-        mass, *areas = every_stratum(self.mesh.lattice, kernel, add, sums, active)
+        sums = [mi.Float(0), mi.Vector2f(0), *(mi.Float(0) for _ in directions)]
+        mass, slope, *areas = every_stratum(self.mesh.lattice, kernel, add, sums, active)
         mass = dr.select(mass > 0, mass, 1)
-        return [area / mass for area in areas]
+        return [area / mass for area in areas], slope / mass
 
     def triangle(self, triangle, w, active):
         """Mean over one effective triangle of max(m̃·ω, 0)/m_z."""
@@ -456,6 +481,12 @@ class ProjectedArea(FootprintArea):
             lambda: clipped_mean(corners, w.z, self.order),
             active,
         )
+
+
+def mean_slope(first, e1, e2) -> mi.Vector2f:
+    """Mean slope over a triangle of projected normals, by the midpoints of its edges."""
+    middles = (first + 0.5 * e1, first + 0.5 * e2, first + 0.5 * (e1 + e2))
+    return sum((slope_of(m) for m in middles), mi.Vector2f(0)) * (1 / 3)
 
 
 def triangle_weight(kernel: TexelKernel, corner, centroid: float):
@@ -515,61 +546,126 @@ def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
 #  The smallest footprints
 # ------------------------------------------------------------------------------------------------
 
-#: Points of the kernel over which the mean is taken, Fibonacci numbers, for footprints that touch
-#: no more quads than TINY_QUADS and for larger ones; and the fractional part of the golden ratio,
-#: which spreads them evenly. With the numbers below these, a furnace reflects up to 1.2 and 8.6 of
-#: what it receives on maps whose normals jump from texel to texel, with these 1.02; the rest is
-#: for MISSED.
-TINY_QUADS, POINTS_OF_TINY, POINTS = 4, 34, 55
-GOLDEN = (5**0.5 - 1) / 2
+#: Points of the kernel over which the mean is taken, by the number of quads that a footprint
+#: touches at most: Fibonacci numbers.
+POINTS = ((4, 34), (64, 55), (256, 89), (inf, 144))
 
-#: Share by which masking raises Λ where it comes from points, which costs at most 1 % of a facet's
-#: light. Without, a furnace reflects up to 1.014 of what it receives on maps of grooves and flakes,
-#: whose degenerate triangles are missed; with it, 1.0015 (``python -m benchmarks projected_area``).
-MISSED = 0.04
+#: Fractional part of the golden ratio, which spreads the points evenly.
+GOLDEN = (5**0.5 - 1) / 2
 
 #: Ω of the GGX area (:func:`ggx_area`) over the variance of slopes which are uniformly distributed
 #: over an interval: with it, both see the same at grazing angles.
 UNIFORM = 0.75
 
 
-def mean_over_points(mesh: TexelMesh, kernel: TexelKernel, directions: list, active) -> list:
-    """P(ω) for each direction as the mean over points of the kernel, all of equal weight.
+def mean_over_points(
+    mesh: TexelMesh,
+    kernel: TexelKernel,
+    directions: list,
+    active: mi.Bool,
+    jumps: bool,
+    roughness: mi.Float | float = 0.0,
+) -> tuple[list, mi.Vector2f]:
+    """P(ω) for each direction, and the slope, as means over points of the kernel, all of equal
+    weight.
 
     A point stands for a cell of the kernel, of the area 1/(N k), over which the slopes vary by the
     triangle's Jacobian: it has the projected area of this spread, not of a single facet, so that
     what faces ω in a corner of the cell is not missed.
+
+    Degenerate triangles are single facets, whose neighbours may face anywhere: their Jacobian tells
+    nothing. Points within them do not count, and they are added with their mass under the kernel.
+
+    Args:
+        mesh: the manifold; without jumps, anything with its ``frame_at``.
+        jumps (bool): whether the mesh has any; see :func:`has_degenerate_triangles`.
+        roughness: variance of the projected normals of every facet.
     """
-    tiny = kernel.touched_quads() <= TINY_QUADS
-    count, share = (
-        dr.select(tiny, kind(few), kind(many))
-        for kind, few, many in (
-            (mi.UInt32, POINTS_OF_TINY, POINTS),
-            (mi.Float, 1 / POINTS_OF_TINY, 1 / POINTS),
-        )
-    )
+    quads, count = kernel.touched_quads(), mi.UInt32(POINTS[-1][1])
+    for most, points in POINTS[-2::-1]:
+        count = dr.select(quads <= most, points, count)
+    share = dr.rcp(mi.Float(count))
 
-    def slope_along(w, m, z, e):
-        """The derivative of ω·m̃/m_z along an edge of the normal triangle."""
-        flat = mi.Vector2f(w.x, w.y)
-        return dr.fma(dr.dot(flat, m), dr.dot(m, e) / (z * z), dr.dot(flat, e)) / z
-
-    def body(k, *totals):
+    def body(k, found, slope, *totals):
         x, y = ((mi.Float(k) + 0.5) * step for step in (share, GOLDEN))
         offset = kernel.sample(mi.Point2f(x, y - dr.floor(y)))
-        m, e1, e2 = mesh.frame_at(kernel.mean + offset, active)
-        z = dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
+        m, e1, e2, degenerate = mesh.frame_at(kernel.mean + offset, active)
+        counts = active & ~degenerate if jumps else active
+        z = height_of(m)
         new = []
         for w, total in zip(directions, totals, strict=True):
-            mean = dr.fma(w.x, m.x, w.y * m.y) / z + w.z
-            d1, d2 = (slope_along(w, m, z, e) for e in (e1, e2))
-            spread = UNIFORM * share * variance_of_cells(kernel, offset, d1, d2)
-            new.append(total + dr.select(active, ggx_area(mean, spread), 0))
-        return k + 1, *new
+            turn = gradient_along(w, m, z)
+            spread = variance_of_cells(kernel, offset, dr.dot(turn, e1), dr.dot(turn, e2))
+            spread = dr.fma(UNIFORM * share, spread, roughness * dr.squared_norm(turn))
+            area = ggx_area(slope_along(w, m / z), spread)
+            new.append(total + dr.select(counts, area, 0))
+        found = found + dr.select(counts, mi.UInt32(1), 0)
+        return k + 1, found, slope + dr.select(counts, m / z, 0), *new
 
-    state = (mi.UInt32(0), *[mi.Float(0) for _ in directions])
-    totals = symbolic_loop(state, lambda k, *_: active & (k < count), body, "points")[1:]
-    return [total * share for total in totals]
+    state = (mi.UInt32(0), mi.UInt32(0), mi.Vector2f(0), *[mi.Float(0) for _ in directions])
+    _, found, slope, *areas = symbolic_loop(
+        state, lambda k, *_: active & (k < count), body, "points"
+    )
+    share = dr.rcp(mi.Float(dr.maximum(found, 1)))
+    areas, slope = [area * share for area in areas], slope * share
+    if not jumps:
+        return areas, slope
+    mass, single_slope, *single_areas = degenerate_triangles(mesh, kernel, directions, active)
+    # The rest of the mass is that of the points, as far as there are any.
+    rest = dr.select(found > 0, dr.maximum(1 - mass, 0), 0)
+    mass = dr.maximum(mass + rest, 1e-6)
+    areas = [
+        dr.fma(rest, area, single) / mass for area, single in zip(areas, single_areas, strict=True)
+    ]
+    return areas, (slope * rest + single_slope) / mass
+
+
+def has_degenerate_triangles(mesh: TexelMesh) -> bool:
+    """Whether any triangle of a mesh is replaced by an equilateral one."""
+    with dr.suspend_grad():
+        columns = mesh.lattice.x.quads
+        index = dr.arange(mi.UInt32, columns * mesh.lattice.y.quads)
+        n0, n1, n2, n3 = mesh.quad_normals(mi.Int(index // columns), mi.Int(index % columns))
+        any_of = is_degenerate(n0, (n1, n2), mesh.epsilon)
+        any_of |= is_degenerate(n3, (n1, n2), mesh.epsilon)
+        return bool(dr.any(any_of))
+
+
+def degenerate_triangles(mesh: TexelMesh, kernel: TexelKernel, directions: list, active) -> tuple:
+    """Mass of the degenerate triangles under the kernel, and integrals over them: of the slope, and
+    of the projected area for each direction."""
+    variance = 2 * mesh.epsilon / (3 * sqrt(3))  # the square of the circumradius: none is farther
+    # Where in a triangle the kernel has its mean: as if both were Gaussians. A triangle's variance
+    # along its legs is 1/18.
+    pull = [dr.rcp(1 + 18 * dr.square(x)) for x in (kernel.sigma_u, kernel.sigma_v)]
+
+    def inside(corner, centroid: float):
+        return [dr.fma(-x - centroid, t, centroid) for x, t in zip(corner, pull, strict=True)]
+
+    def add(sums, row, column, corner, active):
+        normals = n0, n1, n2, n3 = mesh.quad_normals(row, column, active)
+        degenerate = [is_degenerate(n, (n1, n2), mesh.epsilon) for n in (n0, n3)]
+
+        def added(mass, slope, *areas):
+            masses = kernel.masses_in_quad(corner)
+            for k in (0, 1):
+                weight = dr.select(degenerate[k], masses[k], 0)
+                l1, l2 = (dr.clip(x, 0, 1) for x in inside(corner, (k + 1) / 3))
+                l2 = dr.maximum(l2, 1 - l1) if k else dr.minimum(l2, 1 - l1 - 1e-6)
+                m = normal_in_quad(l1, l2, normals, mesh.epsilon)
+                z = height_of(m)
+                mass, slope = mass + weight, slope + weight * m / z
+                new = []
+                for w, area in zip(directions, areas, strict=True):
+                    spread = variance * dr.squared_norm(gradient_along(w, m, z))
+                    new.append(dr.fma(weight, ggx_area(slope_along(w, m / z), spread), area))
+                areas = new
+            return mass, slope, *areas
+
+        return where_needed(active & (degenerate[0] | degenerate[1]), added, sums)
+
+    zero = (mi.Float(0), mi.Vector2f(0), *(mi.Float(0) for _ in directions))
+    return every_quad(mesh.lattice, kernel, add, active, zero)
 
 
 def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
@@ -589,56 +685,37 @@ def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
 #  Approximation by a smooth P-NDF (Eq. 13)
 # ------------------------------------------------------------------------------------------------
 
-#: Directions of the half circle at which the fit is made.
-AZIMUTHS = 8
-
-#: Footprints that touch no more quads than this are no matter of averages over a texel or more:
-#: the fit gives way to points of the kernel. A round one has a standard deviation of 1.2 texels.
-FINE_QUADS = 64
-
-
-def ggx_area(mean, rough):
-    """P' of a GGX distribution of slopes, ½ (w̄ + √(w̄² + ω_xyᵀ Ω ω_xy)); 0 for w̄ < 0 and Ω = 0.
-
-    ``mean``: w̄; ``rough``: the square ω_xyᵀ Ω ω_xy.
-    """
-    root = dr.sqrt(dr.maximum(dr.fma(mean, mean, rough), 1e-20))
-    return 0.5 * dr.select(mean >= 0, mean + root, rough / dr.select(mean >= 0, 1, root - mean))
+#: Footprints that touch no more quads than this, by their kernel, see points of the kernel in place
+#: of the fit. A round Gaussian has a standard deviation of 1.2 texels then: smaller ones are no
+#: matter of averages over a texel or more. A disk or a box has one of 13 texels: their mean slope
+#: is not that of a Gaussian, by as much as makes 7 % of the energy at 5 texels.
+FINE_QUADS = {"gaussian": 64, "disk": 1600, "box": 1600}
 
 
 class GgxFit(FootprintArea):
-    r"""P(ω) of the GGX distribution of slopes that fits the facets under a footprint.
+    r"""P(ω) of the smooth distribution of slopes that fits the facets under a footprint.
 
-    The paper's Eq. 13, with the bracket that its print lost, is
-    ``P' = ½ (ω_z + √(ω_z² + ω_xyᵀ Ω ω_xy))``, that of slopes around zero. Facets under a footprint
-    lean: around their mean slope s̄ (here −∇h, so that m̃·ω/m_z = ω_z + s·ω_xy) it is
+    The paper's Eq. 13, with the bracket that its print lost, is the area of a GGX distribution of
+    slopes around zero, ``P' = ½ (ω_z + √(ω_z² + ω_xyᵀ Ω ω_xy))``, with Ω fitted to P at grazing
+    angles. Facets under a footprint lean: around their mean slope s̄ it is that with
+    ``w̄ = ω_z + s̄·ω_xy`` in place of ω_z, for a distribution moved by s̄ sees ω_z moved by s̄·ω_xy
+    (Dupuy et al., "Linear Efficient Antialiased Displacement and Reflectance Mapping", 2013).
 
-        P' = ½ (w̄ + √(w̄² + ω_xyᵀ Ω ω_xy)),        w̄ = ω_z + s̄·ω_xy,
+    Its tails are those of GGX slopes, which the slopes of a map have not: under a footprint of 3
+    texels on Gaussian bumps of slopes 0.15, facets reflect 3 % too little from 69°. And what is
+    fitted at the horizon says little of a footprint that leans away, where the facets that are seen
+    from above are not seen from the horizon: such places reflect up to 8 % more than they receive.
+    So Ω follows from the slopes' covariance, and the GGX form is used where the mean plane is seen
+    from behind; in front of it, that of a Gaussian (:func:`~.area_of_moments`).
 
-    for a distribution moved by s̄ sees ω_z moved by s̄·ω_xy (Dupuy et al., "Linear Efficient
-    Antialiased Displacement and Reflectance Mapping", 2013). It is never below the projected area
-    of a plane of slope s̄, as no distribution's is.
+    Mean slope and covariance are averages over the footprint, taken by a :class:`~.MomentPyramid`:
+    levels are Gaussians of growing width, so a round footprint mixes the two next in size, and a
+    stretched one sums lookups along its axis. In place of the kernel stands the Gaussian with its
+    covariance (:func:`gaussian_like`).
 
-    At grazing angles, ω_z = 0, this is linear in Ω, ``4 P (P − w̄) = ω_xyᵀ Ω ω_xy``, which gives Ω
-    by least squares over :data:`AZIMUTHS` directions, and no less than that in any of them
-    (:func:`fit`); the other half of the circle says the same, as P(−ω) = P(ω) − w̄. Mean slope and
-    P at grazing angles are averages over the footprint, taken by a
-    :class:`~.MomentPyramid`: levels are Gaussians of growing width, so a round
-    footprint mixes the two next in size, and a stretched one sums lookups along its axis. What is
-    stored and interpolated is (s̄, Ω + s̄ s̄ᵀ), the raw moments of two facets ±√Ω: slopes that differ
-    between the samples of a level then count as roughness, and as P' is a concave function of the
-    raw moments, what was not below P at the samples is not below it between them.
+    Smaller footprints (:data:`FINE_QUADS`) see :func:`mean_over_points` instead.
 
-    Footprints of little more than a texel (:data:`FINE_QUADS`) see :func:`mean_over_points`
-    instead: there a distribution fitted to a wider place reflects more than it receives wherever a
-    few facets face a grazing direction.
-
-    What remains is the shape: GGX slopes have tails that Gaussian ones have not. Under large
-    footprints of a map of Gaussian bumps of roughness 0.15, no masking at all is nearer to the
-    exact one down to ω_z = 0.2, where the fit's G1 is off by 0.03; the fit is twice as near at 0.1,
-    and twelve times at 0.05.
-
-    Built in less time than a cache would take to read. Beyond a texel the footprint is Gaussian.
+    Built in less time than a cache would take to read.
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
@@ -649,10 +726,8 @@ class GgxFit(FootprintArea):
         pyramid (MomentPyramid): None where all footprints see :func:`mean_over_points`.
     """
 
-    few = FINE_QUADS
-
     def __init__(self, mesh: TexelMesh, domain: Domain | None = None) -> None:
-        self.mesh, self.domain = mesh, domain
+        self.mesh, self.domain, self.few = mesh, domain, FINE_QUADS[mesh.kernel]
         self.parameters_changed()
 
     def parts(self) -> dict[str, int]:
@@ -661,148 +736,94 @@ class GgxFit(FootprintArea):
         levels = f"{self.pyramid.first} to {self.pyramid.top}"
         return {f"masking, MIP levels {levels}": self.pyramid.nbytes}
 
-    def parameters_changed(self) -> None:
-        """Fit anew to the data of the mesh."""
-        self.pyramid = None
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Average anew the data of the mesh."""
+        if keys and "data" not in keys:
+            return
+        self.pyramid, self.jumps = None, has_degenerate_triangles(self.mesh)
         if self.domain is not None and self.domain.most_quads <= self.few:
             return
         self.pyramid = MomentPyramid(
             self.mesh.data,
             self.mesh.normal_map.wrap_mode,
             None,
-            over_quad=partial(grazing_areas, epsilon=self.mesh.epsilon),
-            finish=fit,
+            over_quad=partial(slopes_of_quad, epsilon=self.mesh.epsilon),
+            spread=COVARIANCE,
             domain=self.domain,
         )
 
-    def areas(self, directions: list, query: Query, active: mi.Bool) -> list:
+    def projected_areas(self, directions, query, active):
         kernel = self.mesh.texel_kernel(query)
         fine = kernel.touched_quads() <= self.few
-        by_points = mean_over_points(self.mesh, kernel, directions, active & fine)
+        by_points = mean_over_points(self.mesh, kernel, directions, active & fine, self.jumps)
         if self.pyramid is None:
             return by_points
-        slope_x, slope_y, xx, xy, yy = self.pyramid.average(query, active & ~fine)
-        areas = []
-        for w, mean_of_points in zip(directions, by_points, strict=True):
-            leaning = dr.fma(slope_x, w.x, slope_y * w.y)
-            raw = w.x * w.x * xx + 2 * w.x * w.y * xy + w.y * w.y * yy
-            rough = dr.maximum(dr.fma(-leaning, leaning, raw), 0)
-            areas.append(dr.select(fine, mean_of_points, ggx_area(w.z + leaning, rough)))
-        return areas
+        alike = gaussian_like(kernel, query.footprint)
+        x, y, xx, yy, xy = self.pyramid.average(alike, active & ~fine)
+        slope = mi.Vector2f(x, y)
+        areas = [
+            area_of_moments(slope_along(w, slope), variance_along(w, (xx, xy, yy)))
+            for w in directions
+        ]
+        return choose_areas(fine, by_points, (areas, slope))
 
     def __repr__(self) -> str:
         return f"ggx_fit[{sum(self.parts().values()) / 2**20:.1f} MiB]"
 
 
-def azimuths() -> list[tuple[float, float]]:
-    """Horizontal unit vectors, evenly over a half circle."""
-    angles = (np.pi * (k + 0.5) / AZIMUTHS for k in range(AZIMUTHS))
-    return [(float(np.cos(angle)), float(np.sin(angle))) for angle in angles]
+def gaussian_like(kernel: TexelKernel, footprint: Footprint) -> Footprint:
+    """The footprint whose whole Gaussian has the covariance of a kernel under ``footprint``.
 
-
-def grazing_areas(normals, epsilon: float) -> list:
-    """The mean slope of a quad's facets, and their projected area in every horizontal direction.
-
-    ``normals``: n0…n3 at its corners. Over each of the effective triangles the slope counts as
-    linear, so that only the corners' slopes matter.
+    A disk of the Mahalanobis radius ρ has ρ²/4 of the Gaussian's covariance, a Gaussian cut there
+    1 − ½ ρ²/(exp(½ ρ²) − 1); a box has ρ²/3 of the variances along the axes, and none across.
     """
-    totals = None
-    for first, e1, e2 in triangles_of_quad(normals, epsilon):
-        slopes = [
-            m / dr.maximum(dr.safe_sqrt(1 - dr.squared_norm(m)), LOWEST)
-            for m in (first, first + e1, first + e2)
-        ]
-        mean = (slopes[0] + slopes[1] + slopes[2]) / 3
-        areas = [mean_positive([dr.fma(s.x, x, s.y * y) for s in slopes]) for x, y in azimuths()]
-        values = [mean.x, mean.y, *areas]
-        totals = (
-            values
-            if totals is None
-            else [0.5 * (a + b) for a, b in zip(totals, values, strict=True)]
-        )
-    return totals
+    reach = REACH[kernel.kernel]
+    if kernel.kernel == "box":
+        share = reach / sqrt(3)
+        u = dr.norm(mi.Vector2f(footprint.du.x, footprint.dv.x))
+        v = dr.norm(mi.Vector2f(footprint.du.y, footprint.dv.y))
+        return Footprint(footprint.uv, mi.Vector2f(share * u, 0), mi.Vector2f(0, share * v))
+    half = 0.5 * reach**2
+    share = sqrt(0.5 * half) if kernel.kernel == "disk" else sqrt(1 - half / (exp(half) - 1))
+    return Footprint(footprint.uv, share * footprint.du, share * footprint.dv)
 
 
-def mean_positive(corners: list):
-    """Mean over a triangle of max(f, 0) for a linear f with these values at the corners.
+def slopes_of_quad(normals, epsilon: float) -> list:
+    """Mean and central second moments of the slopes of a quad's effective triangles.
 
-    Where f changes its sign around one corner, of the value a, while b and c are the others, the
-    part of a's sign is a triangle and adds a³/(3 (a − b)(a − c)).
+    ``normals``: n0…n3 at its corners. By the midpoints of the triangles' edges, as
+    :func:`~.midpoint_rule`.
     """
-    x, y, z = corners
-    low, high = dr.minimum(dr.minimum(x, y), z), dr.maximum(dr.maximum(x, y), z)
-    middle = dr.maximum(dr.minimum(x, y), dr.minimum(dr.maximum(x, y), z))
-
-    def cut_off(a, b, c):
-        divisor = 3 * (a - b) * (a - c)
-        return dr.select(divisor > 0, a * a * a / dr.select(divisor > 0, divisor, 1), 0)
-
-    mean = (x + y + z) / 3
-    alone_above = dr.select(high > 0, cut_off(high, middle, low), 0)
-    alone_below = mean - dr.select(low < 0, cut_off(low, middle, high), 0)
-    return dr.select(middle > 0, alone_below, alone_above)
-
-
-def fit(averages: list) -> list:
-    """The raw moments (s̄_x, s̄_y, R_xx, R_xy, R_yy) of averages of :func:`grazing_areas`.
-
-    Least squares leave Ω too small in some directions, even negative, and a surface that shows too
-    small an area reflects more than it receives. One after the other, the directions for which Ω
-    falls short raise it, along themselves by what is missing.
-    """
-    slope_x, slope_y, *areas = averages
-    directions = azimuths()
-    squares = [
-        4 * area * (area - slope_x * x - slope_y * y)
-        for area, (x, y) in zip(areas, directions, strict=True)
+    slopes = [
+        slope_of(m)
+        for first, e1, e2 in triangles_of_quad(normals, epsilon)
+        for m in (first + 0.5 * e1, first + 0.5 * e2, first + 0.5 * (e1 + e2))
     ]
-    solve = np.linalg.pinv([[x * x, 2 * x * y, y * y] for x, y in directions])
-    xx, xy, yy = (
-        sum((float(c) * v for c, v in zip(row, squares, strict=True)), mi.Float(0)) for row in solve
-    )
-    for square, (x, y) in zip(squares, directions, strict=True):
-        missing = dr.maximum(square - (x * x * xx + 2 * x * y * xy + y * y * yy), 0)
-        xx, xy, yy = xx + missing * x * x, xy + missing * x * y, yy + missing * y * y
-    return [slope_x, slope_y, xx + slope_x * slope_x, xy + slope_x * slope_y, yy + slope_y**2]
+    mean = sum(slopes, mi.Vector2f(0)) * (1 / len(slopes))
+    xx = yy = xy = mi.Float(0)
+    for slope in slopes:
+        x, y = slope - mean
+        xx, yy, xy = dr.fma(x, x, xx), dr.fma(y, y, yy), dr.fma(x, y, xy)
+    return [mean.x, mean.y, *(moment * (1 / len(slopes)) for moment in (xx, yy, xy))]
 
 
-class ProjectedAreaMasking(SmithMasking):
-    """Smith's masking from a projected area: Λ(ω) = P(ω)/ω_z − 1 (Wu24, section 4.3).
-
-    Where the facets lean away from ω, P falls below the projected area ω_z of the whole surface:
-    those that face ω then hide no other, Λ = 0.
-
-    A surface whose P is too small reflects more than it receives, and :func:`mean_over_points` may
-    miss facets where degenerate triangles make the normals jump: Λ is raised by :data:`MISSED`
-    where P comes from points.
+class ProjectedAreaMasking(MeanPlaneMasking):
+    """Masking over the mean plane, by an estimate of P that it keeps (Wu24, section 4.3).
 
     Args:
-        area (ProjectedArea | GgxFit): P.
+        area (FootprintArea): the estimate.
         height_correlated (bool): see :class:`~.SmithMasking`.
     """
 
-    def __init__(self, area: ProjectedArea | GgxFit, height_correlated: bool = True) -> None:
-        super().__init__(height_correlated)
+    def __init__(self, area: FootprintArea, height_correlated: bool = True) -> None:
+        super().__init__(area, height_correlated, str(area))
         self.area = area
 
     def parts(self) -> dict[str, int]:
         return self.area.parts()
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        if not keys or "data" in keys:
-            self.area.parameters_changed()
-
-    def smith_lambdas(self, directions: list, query: Query, active: mi.Bool) -> list:
-        areas = self.area.areas(directions, query, active)
-        by_points = self.area.mesh.texel_kernel(query).touched_quads() <= self.area.few
-        scale = dr.select(by_points, 1 + MISSED, 1)
-        return [
-            scale * dr.maximum(area / dr.maximum(w.z, 1e-12) - 1, 0)
-            for w, area in zip(directions, areas, strict=True)
-        ]
-
-    def __repr__(self) -> str:
-        return f"{self.area}, height_correlated = {self.height_correlated}"
+        self.area.parameters_changed(keys)
 
 
 def area(name: str, mesh: TexelMesh, domain: Domain | None) -> FootprintArea | None:

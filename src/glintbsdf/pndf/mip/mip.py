@@ -31,10 +31,11 @@ from glintbsdf.footprint.kernels import REACH, SIGMA_MIN, TexelKernel
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap, map_bytes
 from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
+from glintbsdf.microfacet.mean_plane import lobe_area, slope_of
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
-from glintbsdf.pndf.manifold.mesh import add_where
+from glintbsdf.pndf.manifold.mesh import add_where, where_needed
 from glintbsdf.pndf.mip import levels as lobe_levels
 from glintbsdf.pndf.mip.cells import LevelCells
 from glintbsdf.pndf.mip.packing import NORMAL_CUT, Lobe
@@ -88,6 +89,8 @@ class Mip(PNDF):
 
     Raises :class:`~.ParameterError`.
     """
+
+    maskings = ("footprint", "beckmann", "none")
 
     def __init__(
         self,
@@ -338,6 +341,44 @@ class Mip(PNDF):
         mass = dr.select(summed, mass, self.mass_of_texels(kernel))
         return dr.select(mass > 0, density / dr.select(mass > 0, mass, 1), 0)
 
+    def projected_areas(self, directions, query, active):
+        """Those of the lobes, every one of them with its own."""
+        kernel = self.texel_kernel(query)
+        below, above, fraction = self.level(kernel)
+        blended = active & (fraction > 0)
+        finer = self.areas_of_level(directions, query, kernel, below, active)
+        coarser = self.areas_of_level(directions, query, kernel, above, blended)
+        share = dr.select(blended, fraction, 0)
+        *areas, slope = (dr.lerp(a, b, share) for a, b in zip(finer, coarser, strict=True))
+        return areas, slope
+
+    def areas_of_level(self, directions, query, kernel, level, active) -> list:
+        """The projected areas of one level's lobes, and their mean slope."""
+        variance = dr.square(self.sigma_r)
+        cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
+
+        def add(state, lobe, offset, sign, active):
+            seen = lobe.under(offset, extent, *self.seen(kernel, sign))
+            weight = seen.weight(cut)
+
+            def added(mass, slope, *areas):
+                normals = seen.normals()
+                q_xx, q_yx, q_yy = normals.rest
+                vectors = (*normals.vectors, mi.Vector2f(q_xx, q_yx), mi.Vector2f(0, q_yy))
+                areas = [
+                    dr.fma(weight, lobe_area(w, normals.mean, vectors, variance), area)
+                    for w, area in zip(directions, areas, strict=True)
+                ]
+                slope = slope + mi.Vector2f(weight * slope_of(normals.mean))
+                return mass + weight, slope, *areas
+
+            return where_needed(active & (weight > 0), added, state)
+
+        zero = (mi.Float(0), mi.Vector2f(0), *(mi.Float(0) for _ in directions))
+        mass, slope, *areas = self.visit(query.footprint, kernel, level, add, zero, active)
+        inverse = dr.rcp(dr.select(mass > 0, mass, 1))
+        return [*(area * inverse for area in areas), slope * inverse]
+
     def cut(self, kernel: TexelKernel, level: mi.UInt32) -> mi.Float:
         """Squared distance at which lobes are cut."""
         return dr.select(level == 0, self.texel_cut(kernel), GRID_CUT)
@@ -449,11 +490,3 @@ class Mip(PNDF):
             f"Mip[{self.synthesis}, clusters={self.clusters}, lod_scale={self.lod_scale:g}, "
             f"sigma_r={self.sigma_r[0]:g}, {self.wrap_mode}, {self.nbytes / 1e6:.1f} MB]"
         )
-
-
-def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
-    """``added(*sums)``: in a branch, for the lanes that need it; with derivatives, for all lanes,
-    as :func:`~.add_where` does."""
-    if dr.grad_enabled(added(*sums)):
-        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
-    return dr.if_stmt(sums, needed, added, lambda *sums: sums)
