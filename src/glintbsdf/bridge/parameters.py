@@ -188,6 +188,7 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         "hide_emitters": FLAG,
         "separate": FLAG,
         "pixel_share": SHARE,
+        "light_share": SHARE,
         "emitters": NAME,
     },
 }

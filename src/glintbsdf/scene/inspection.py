@@ -11,7 +11,7 @@ case.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -156,6 +156,7 @@ class Finding:
         complete, trimmed (dict[str, int]): memory of each part, bytes. Both are the same where
             nothing can be trimmed.
         left_out (list[str]): what its parameters leave out of what is built and evaluated.
+        notes (list[str]): what has been decided about the numbers of its map.
     """
 
     plugin: str
@@ -165,10 +166,12 @@ class Finding:
     complete: dict[str, int]
     trimmed: dict[str, int]
     left_out: list[str]
+    notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         lines = [f'{self.plugin} "{self.name}"' if self.name else self.plugin]
         lines += self.lines("map", self.asked())
+        lines += self.lines("read", self.notes)
         lines += self.lines("built", amounts(self.complete))
         saved = sum(self.complete.values()) - sum(self.trimmed.values())
         if saved >= NOTABLE:
@@ -234,6 +237,15 @@ def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> li
     build(inspected)
     domains = survey(inspected, spp, which)  # once more, by the glints themselves
     return [
-        Finding(bsdf.owner, bsdf.name, bsdf.map_shape, domain, bsdf.parts(), parts, bsdf.left_out())
+        Finding(
+            bsdf.owner,
+            bsdf.name,
+            bsdf.map_shape,
+            domain,
+            bsdf.parts(),
+            parts,
+            bsdf.left_out(),
+            [note.text for note in bsdf.normal_map.notes] if bsdf.normal_map else [],
+        )
         for bsdf, domain, parts in zip(inspected.bsdfs, domains, trimmed, strict=True)
     ]
