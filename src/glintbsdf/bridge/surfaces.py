@@ -7,6 +7,7 @@ active variant, also those inside a ``shapegroup``, which ``scene.shapes()`` lea
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 from collections.abc import Iterator
 
@@ -54,13 +55,31 @@ def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:
 
 
 def _holds(material: mi.Object, bsdf: mi.BSDF) -> bool:
-    """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth.
+    """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth."""
+    look = _look_class(mi.variant())(bsdf)
+    material.traverse(look)
+    return look.found
 
-    Mitsuba's own traversal finds it. A callback class that is made here and knows ``bsdf`` would
-    keep it alive, as every class is part of a cycle, and Dr.Jit records calls of every BSDF that is
-    alive.
+
+@functools.cache
+def _look_class(variant: str) -> type:
+    """The traversal of :func:`_holds`, in a variant.
+
+    It is made once, and holds nothing by a closure. A class is part of reference cycles: one that
+    was made for each search would keep its BSDF alive until Python's collector comes, perhaps in
+    the middle of a recording that still calls it.
     """
-    return any(node is bsdf for node in mi.traverse(material).hierarchy)
+
+    class Look(mi.TraversalCallback):
+        def __init__(self, bsdf: mi.BSDF) -> None:
+            super().__init__()
+            self.bsdf, self.found = bsdf, False
+
+        def put(self, name: str, value: object, flags: int, *rest: object) -> None:
+            if isinstance(value, mi.BSDF) and not self.found:
+                self.found = value is self.bsdf or _holds(value, self.bsdf)
+
+    return Look
 
 
 def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:
