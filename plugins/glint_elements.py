@@ -146,7 +146,7 @@ class GlintElements(GlintBSDF):
                 "step": parameters.number("step", 0.5),
                 "curved": elements == "curved",
             }
-        self.finish()
+        self.finish(Flakes if self.normal_map is None else Elements)
 
     def create(self, domain: Domain | None) -> Elements | Flakes:
         if self.normal_map is None:

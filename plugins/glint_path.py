@@ -30,6 +30,12 @@ Path tracer with footprints (:monosp:`glint_path`)
      samples. 0 is sampling alone. (Default: :monosp:`auto`, one for a single sample per pixel,
      falling slowly with their number)
 
+ * - light_share
+   - |string| or |float|
+   - Share of a small light's extent that P-NDFs integrate, in [0, 1]; the rest is sampled. 0 is
+     sampling alone. (Default: :monosp:`auto`, one for a single sample per pixel, falling slowly
+     with their number)
+
  * - emitters
    - |string|
    - Which emitters are asked at a hit: :monosp:`all`, that is every small one of at most 16, the
@@ -76,6 +82,19 @@ derivatives, which Mitsuba renders by itself.
 Environments are not small; one emitter of all those that are not asked is chosen in proportion to
 its ``sampling_weight``.
 
+**Small lights are integrated by the P-NDF**, where it can do that: that of
+:ref:`glint_elements <bsdf-glint_elements>`. A light seen as a disk of up to 0.5 radians, or as
+another surface with such variances of directions, is split as the pixel is. A share of its
+variance becomes a spread of half vectors, over which the P-NDF is averaged in closed form; the rest
+is sampled, by directions contracted towards the light's centre. Visibility and radiance are those
+of the points themselves, so shadows and textures keep their mean. BSDF sampling then finds these
+lights no more, and nothing counts twice.
+
+Over a footprint the half vector turns, as the surface is curved, and camera and light are near.
+These BSDFs are told how: the P-NDF sees the map as if its normals turned the other way. On a ball
+under four lights as large as the sun, at 14 texels to a pixel and 16 samples, the bias of the image
+falls from 0.115 of its contrast to 0.02 by that.
+
 **Separated illumination.** Light that has been scattered before it arrives comes from everywhere,
 and what glints add to its reflection is noise rather than something to see. With
 :monosp:`separate` on, glints are therefore kept to *direct* light, and glint BSDFs show *indirect*
@@ -115,13 +134,15 @@ the glints. In BSDFs of one's own: see ``glintbsdf.bridge.separation``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.bridge import filter_sampling
+from glintbsdf.bridge.bsdf import prepare_for_lights
+from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried, half_vector_turn
 from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.bridge.separation import smooth_context
 from glintbsdf.core.errors import check, check_choice, check_whole
@@ -144,6 +165,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         max_depth = props.get("max_depth", -1)
         rr_depth = props.get("rr_depth", 5)
         pixel_share = props.get("pixel_share", "auto")
+        light_share = props.get("light_share", "auto")
         emitters = props.get("emitters", "all")
         owner = props.plugin_name()
         check_whole(
@@ -152,11 +174,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         check_whole(rr_depth, lambda d: d in range(1, 2**31), owner, "rr_depth", "> 0")
         check(isinstance(separate, bool), owner, "separate", "true or false", separate)
         check_share(owner, "pixel_share", pixel_share)
+        check_share(owner, "light_share", light_share)
         check_choice(owner, "emitters", emitters, ("all", "one"))
         self.separate = separate
         self.max_depth = max_depth if max_depth >= 0 else 0xFFFFFFFF
         self.rr_depth = rr_depth
-        self.pixel_share, self.emitters = pixel_share, emitters
+        self.pixel_share, self.light_share, self.emitters = pixel_share, light_share, emitters
         self.pixels_per_differential = None
 
     # ------------------------------------------------------------------------------------------
@@ -223,6 +246,10 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         sized.scale_differential(dr.opaque(mi.Float, self.pixels_per_differential * samples**0.5))
         return sized
 
+    def share_of_lights(self, samples: int) -> float:
+        """The share of a light's extent that the P-NDF integrates."""
+        return automatic_share(samples) if self.light_share == "auto" else self.light_share
+
     @dr.syntax
     def sample(
         self,
@@ -237,7 +264,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         if dr.hint(self.max_depth == 0, mode="scalar"):
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
 
-        lights = SmallLights(scene, self.emitters == "all" and has_footprints(scene))
+        glints = has_footprints(scene)
+        share = self.share_of_lights(sampler.sample_count()) if glints else 0
+        if share > 0:
+            prepare_for_lights()
+        lights = SmallLights(scene, self.emitters == "all" and glints, share > 0)
+        light_share = dr.opaque(mi.Float, share) if share > 0 else None
         ray_ = self.sized(ray_, sampler.sample_count())
         samples = dr.opaque(mi.Float, sampler.sample_count())
 
@@ -261,6 +293,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         si_prev = dr.zeros(mi.Interaction3f)
         bsdf_pdf_prev = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
+        integrated_prev = mi.Bool(False)  # By the BSDF: small lights
 
         # An environment is visible by itself, everything else once a path has met it
         valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
@@ -279,7 +312,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         while dr.hint(
             active,
             max_iterations=self.max_depth,
-            exclude=[ray_, lights, samples],
+            exclude=[ray_, lights, samples, light_share],
             label="glint_path",
         ):
             # The curvature of the surface is what bends ray cones
@@ -287,7 +320,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             # ---------------------- Direct emission ----------------------
 
-            emitted = emission(lights, scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev)
+            emitted = emission(
+                lights, scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev, integrated_prev
+            )
             if dr.hint(self.separate, mode="scalar"):
                 L_direct[seen] = spectrum_fma(β, emitted, L_direct)
                 L[~seen] = spectrum_fma(β, emitted, L)
@@ -311,29 +346,35 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 # Where a path ends nothing is reflected, and a wide footprint would be costly
                 si.duv_dx = dr.select(active_next, si.duv_dx, 0)
                 si.duv_dy = dr.select(active_next, si.duv_dy, 0)
+                curved = dr.detach(mi.SurfaceInteraction3f(si))
+            # BSDFs are told of the curvature in another way
+            si.dn_du, si.dn_dv = mi.Vector3f(0), mi.Vector3f(0)
 
             # ---------------------- Emitter sampling ----------------------
 
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            hit = Hit(scene, si, bsdf, lights)
+            if dr.hint(light_share is not None, mode="scalar"):
+                hit.integrate_lights(curved, cone, light_share)
             if dr.hint(self.separate, mode="scalar"):
                 lit = direct_light(
-                    lights,
-                    scene,
-                    sampler,
-                    si,
-                    bsdf,
-                    [(bsdf_ctx, active_em & ~seen), (glint_ctx, active_em & seen)],
+                    hit, sampler, [(bsdf_ctx, active_em & ~seen), (glint_ctx, active_em & seen)]
                 )
                 L = spectrum_fma(β, lit[0], L)
                 L_direct = spectrum_fma(β, lit[1], L_direct)
             else:
-                lit = direct_light(lights, scene, sampler, si, bsdf, [(bsdf_ctx, active_em)])
+                lit = direct_light(hit, sampler, [(bsdf_ctx, active_em)])
                 L = spectrum_fma(β, lit[0], L)
 
             # ---------------------- BSDF sampling ----------------------
 
             sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
-            bs, bsdf_weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_next)
+            active_bs = active_next
+            if dr.hint(light_share is not None and not self.separate, mode="scalar"):
+                # Where a path ends next, and no light is left for it to find
+                active_bs &= (depth + 2 < self.max_depth) | ~hit.finds_all_lights()
+            bs, bsdf_weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_bs)
+            bsdf_weight = dr.select(active_bs, bsdf_weight, 0)
             ray_next, bsdf_weight = scatter(bsdf, bsdf_ctx, si, bs, bsdf_weight, active)
 
             # ----------- Glints in direct light (separate) -----------
@@ -348,7 +389,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 ray_glint, weight = scatter(bsdf, glint_ctx, si, bs_glint, weight, glints)
                 si_glint = scene.ray_intersect(ray_glint, glints)
                 pdf = dr.select(glints, bs_glint.pdf, 0)
-                emitted = emission(lights, scene, si_glint, si, pdf, mi.Bool(False))
+                emitted = emission(lights, scene, si_glint, si, pdf, mi.Bool(False), hit.integrates)
                 L_direct[glints] = spectrum_fma(β, weight * emitted, L_direct)
 
                 # A smooth lobe continues the path: emitters that it meets next are not counted
@@ -368,13 +409,14 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 # Mirrors, smooth glass and null interfaces have a discrete density, and no width
                 smooth = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
                 spread = dr.select(smooth, lobe_width(bs.pdf, samples), 0)
-                cone = cone.scattered(si, ray.d, ray_next.d, bs.eta, spread)
+                cone = cone.scattered(curved, ray.d, ray_next.d, bs.eta, spread)
 
             ray = ray_next
 
             # Information about the current vertex needed by the next iteration
             si_prev = mi.Interaction3f(si)
             bsdf_delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            integrated_prev = hit.integrates & ~bsdf_delta_prev
 
             # -------------------- Stopping criterion ---------------------
 
@@ -426,57 +468,108 @@ def has_footprints(scene: mi.Scene) -> bool:
     return any(key.endswith("footprint_sigma") for key in mi.traverse(scene).keys())
 
 
+class Hit:
+    """A surface interaction, and what its BSDF is asked about the scene's lights.
+
+    Attributes:
+        integrates (mi.Bool): whether the BSDF integrates small lights, of which it gets ``share``.
+    """
+
+    def __init__(
+        self,
+        scene: mi.Scene,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        lights: SmallLights,
+    ) -> None:
+        self.scene, self.si, self.bsdf, self.lights = scene, si, bsdf, lights
+        self.integrates, self.share = mi.Bool(False), None
+
+    def integrate_lights(
+        self, curved: mi.SurfaceInteraction3f, cone: RayCone, share: mi.Float
+    ) -> None:
+        """Let BSDFs that can do so integrate a share of small lights.
+
+        Args:
+            curved: the interaction with ``dn_du`` and ``dn_dv``, detached.
+            cone: there, with the differentials of the direction that it is seen from.
+        """
+        self.curved, self.share = curved, share
+        self.integrates = (self.bsdf.flags() & INTEGRATES_LIGHTS) != 0
+        self.turned = cone.turned_per_uv(curved)
+
+    def finds_all_lights(self) -> mi.Bool:
+        """Where emitter sampling leaves no light to BSDF sampling."""
+        mirrors = mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Delta)
+        return self.integrates & ~mirrors & self.lights.all_small(self.si.p)
+
+    def seen_under(
+        self, ds: mi.DirectionSample3f, active: mi.Bool
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f, mi.Bool]:
+        """For a sample of an emitter: the interaction with what it tells the BSDF, the direction
+        that the BSDF is to be asked (world space), and whether it integrates the emitter."""
+        if self.share is None:
+            return self.si, ds.d, mi.Bool(False)
+        with dr.suspend_grad():
+            si = self.curved
+            view = self.lights.view(ds.emitter, si.p, active & self.integrates)
+            variance = dr.select(self.integrates, view.spread(self.share), 0)
+            d = view.contracted(dr.detach(ds.d), variance)
+            far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+            inverse_distance = dr.select(far, 0, dr.rcp(ds.dist))
+            turn = half_vector_turn(si, d, *self.turned, inverse_distance)
+            # A light that BSDF sampling finds as well must be the same to both.
+            small = self.integrates & view.small
+            turn = (dr.select(small | ds.delta, w, 0) for w in turn)
+            told = Carried(*turn, variance).put(si)
+        si = mi.SurfaceInteraction3f(self.si)
+        si.dn_du, si.dn_dv = told.dn_du, told.dn_dv
+        return si, dr.select(variance > 0, d, ds.d), small
+
+
 def direct_light(
-    lights: SmallLights,
-    scene: mi.Scene,
-    sampler: mi.Sampler,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    lobes: list[tuple[mi.BSDFContext, mi.Bool]],
+    hit: Hit, sampler: mi.Sampler, lobes: list[tuple[mi.BSDFContext, mi.Bool]]
 ) -> list[mi.Spectrum]:
-    """What ``bsdf`` reflects of the light that comes straight from emitters: from each one that is
+    """What a BSDF reflects of the light that comes straight from emitters: from each one that is
     asked at every hit, and from one of the others; for each of the ``lobes``, that is a context and
     the lanes in which it is wanted."""
+    lights = hit.lights
     active = lobes[0][1]
     for _, wanted in lobes[1:]:
         active = active | wanted
 
-    def of_sample(ds, weight):
-        return [
-            reflected(scene, si, bsdf, ctx, ds, weight, wanted & active) for ctx, wanted in lobes
-        ]
-
     if lights.asked_count == 0:
-        return of_sample(*scene.sample_emitter_direction(si, sampler.next_2d(), False, active))
-    L = light_of_all(lights, sampler, si, len(lobes), active, of_sample)
+        sample = hit.scene.sample_emitter_direction(hit.si, sampler.next_2d(), False, active)
+        return reflected(hit, lobes, *sample)
+    L = light_of_all(hit, sampler, lobes, active)
     if lights.others_count > 0:
         emitter, probability, random = lights.choose(sampler.next_2d(), active)
-        ds, weight = emitter.sample_direction(si, random, active)
+        ds, weight = emitter.sample_direction(hit.si, random, active)
         ds.emitter = emitter
         ds.pdf *= probability
-        of_other = of_sample(ds, weight * dr.rcp(probability))
+        of_other = reflected(hit, lobes, ds, weight * dr.rcp(probability))
         L = [a + b for a, b in zip(L, of_other, strict=True)]
     return L
 
 
 def light_of_all(
-    lights: SmallLights,
+    hit: Hit,
     sampler: mi.Sampler,
-    si: mi.SurfaceInteraction3f,
-    count: int,
+    lobes: list[tuple[mi.BSDFContext, mi.Bool]],
     active: mi.Bool,
-    of_sample: Callable[[mi.DirectionSample3f, mi.Spectrum], list[mi.Spectrum]],
 ) -> list[mi.Spectrum]:
     """The part of :func:`direct_light` that comes from emitters asked at every hit."""
+    lights = hit.lights
     end = dr.opaque(mi.UInt32, lights.asked_count)
 
     def ask(k, sampler, L):
         emitter = dr.gather(mi.EmitterPtr, lights.asked, k, active)
-        ds, weight = emitter.sample_direction(si, sampler.next_2d(), active)
+        ds, weight = emitter.sample_direction(hit.si, sampler.next_2d(), active)
         ds.emitter = emitter
-        return k + 1, sampler, [a + b for a, b in zip(L, of_sample(ds, weight), strict=True)]
+        of_emitter = reflected(hit, lobes, ds, weight)
+        return k + 1, sampler, [a + b for a, b in zip(L, of_emitter, strict=True)]
 
-    state = mi.UInt32(0), sampler, [mi.Spectrum(0) for _ in range(count)]
+    state = mi.UInt32(0), sampler, [mi.Spectrum(0) for _ in lobes]
     return dr.while_loop(
         state,
         lambda k, sampler, L: active & (k < end),
@@ -487,32 +580,40 @@ def light_of_all(
 
 
 def reflected(
-    scene: mi.Scene,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
-    ctx: mi.BSDFContext,
+    hit: Hit,
+    lobes: list[tuple[mi.BSDFContext, mi.Bool]],
     ds: mi.DirectionSample3f,
     weight: mi.Spectrum,
-    active: mi.Bool,
-) -> mi.Spectrum:
-    """What ``bsdf`` reflects of one sample ``ds`` of an emitter: weighed against the chance that
+) -> list[mi.Spectrum]:
+    """What each lobe reflects of one sample ``ds`` of an emitter: weighed against the chance that
     BSDF sampling would have found it, and zero where something is in between."""
-    active = active & (ds.pdf != 0)
+    sampled = ds.pdf != 0
 
     # Recompute the contribution with AD to enable light source optimization
-    if dr.grad_enabled(si.p):
-        ds.d = dr.normalize(ds.p - si.p)
-        weight = dr.select(ds.pdf != 0, scene.eval_emitter_direction(si, ds, active) / ds.pdf, 0)
+    if dr.grad_enabled(hit.si.p):
+        ds.d = dr.normalize(ds.p - hit.si.p)
+        value = hit.scene.eval_emitter_direction(hit.si, ds, sampled)
+        weight = dr.select(sampled, value / ds.pdf, 0)
 
-    wo = si.to_local(ds.d)
-    value, pdf = bsdf.eval_pdf(ctx, si, wo, active)
-    value = si.to_world_mueller(value, -wo, si.wi)
-    value = value * weight * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-    if not dr.grad_enabled(value):
-        # Most places of a map reflect nothing of a light. (A reversed loop cannot have this mask.)
-        active = active & (dr.max(mi.unpolarized_spectrum(value)) != 0)
-    hidden = scene.ray_test(dr.detach(si.spawn_ray_to(ds.p)), active)
-    return dr.select(active & ~hidden, value, 0)
+    si, d, integrated = hit.seen_under(ds, sampled)
+    wo = si.to_local(d)
+    values, lit, needed = [], mi.Bool(False), []
+    for ctx, active in lobes:
+        active = active & sampled
+        value, pdf = hit.bsdf.eval_pdf(ctx, si, wo, active)
+        value = si.to_world_mueller(value, -wo, si.wi)
+        alone = ds.delta | integrated
+        value = value * weight * dr.select(alone, 1, mis_weight(ds.pdf, pdf))
+        if not dr.grad_enabled(value):
+            # Most places of a map reflect nothing of a light.
+            active = active & (dr.max(mi.unpolarized_spectrum(value)) != 0)
+        values.append(value)
+        needed.append(active)
+        lit = lit | active
+    hidden = hit.scene.ray_test(dr.detach(hit.si.spawn_ray_to(ds.p)), lit)
+    return [
+        dr.select(active & ~hidden, value, 0) for active, value in zip(needed, values, strict=True)
+    ]
 
 
 def emission(
@@ -522,11 +623,15 @@ def emission(
     si_prev: mi.Interaction3f,
     pdf_prev: mi.Float,
     delta_prev: mi.Bool,
+    integrated_prev: mi.Bool,
 ) -> mi.Spectrum:
     """What the emitter at ``si``, if any, sends to ``si_prev``, where a BSDF sample of density
     ``pdf_prev`` has found it: weighed against the chance that emitter sampling would have. Zero
-    where the density is zero."""
+    where the density is zero, and for a small light that the BSDF has integrated."""
     ds = mi.DirectionSample3f(scene, si, si_prev)
+    if lights.extents:
+        counted = integrated_prev & lights.view(ds.emitter, si_prev.p).small
+        pdf_prev = dr.select(counted, 0, pdf_prev)
     em_pdf = lights.pdf_direction(scene, si_prev, ds, ~delta_prev)
     return ds.emitter.eval(si, pdf_prev > 0) * mis_weight(pdf_prev, em_pdf)
 

@@ -207,7 +207,7 @@ def test_shares():
     assert shares[0] == 1 and shares == sorted(shares, reverse=True) and shares[-1] > 0.05
 
 
-@pytest.mark.parametrize("name", ["pixel_share"])
+@pytest.mark.parametrize("name", ["pixel_share", "light_share"])
 @pytest.mark.parametrize("value", [-0.1, 1.5, "all", True, float("nan")])
 def test_bad_shares(variant, name, value):
     with pytest.raises((ParameterError, RuntimeError), match=f'glint_path: "{name}" must be auto'):

@@ -7,10 +7,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakSet
 
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried
 from glintbsdf.bridge.parameters import Parameters, check_to_uv, declared_range
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
@@ -26,6 +28,16 @@ from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.base import PNDF
 from glintbsdf.pndf.displaced import Displaced, DisplacedMasking
 from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
+
+_alive: WeakSet[FootprintBSDF] = WeakSet()
+
+
+def prepare_for_lights() -> None:
+    """Make all that BSDFs need to integrate lights, before a kernel is recorded that asks them."""
+    for bsdf in list(_alive):
+        pndf = getattr(bsdf, "pndf", None)
+        if pndf is not None and bsdf.integrates_lights:
+            pndf.prepare_for_lights()
 
 
 class MakesOpaque:
@@ -72,11 +84,15 @@ class FootprintBSDF(mi.BSDF):
     Raises :class:`~.ParameterError` for values that are not allowed.
     """
 
+    #: Whether it averages over what an interaction carries, see :class:`~.Carried`.
+    integrates_lights = False
+
     normal_map: NormalMap | None = None
     watch: Recorder | Gate | None = None
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        _alive.add(self)
         self.owner, self.name = props.plugin_name(), props.id()
         self.deferred = props.get("deferred", False)
         parameters = Parameters(props)
@@ -179,10 +195,28 @@ class FootprintBSDF(mi.BSDF):
         height, width, wrap_mode = shape
         return SlopeFrame.from_interaction(si, self.to_uv, width, height, wrap_mode == "mirror")
 
-    def query(self, si: mi.SurfaceInteraction3f, active: bool | mi.Bool = True) -> Query:
-        """All that an evaluation at ``si`` asks of the P-NDF; made once for each."""
+    def query(
+        self,
+        si: mi.SurfaceInteraction3f,
+        active: bool | mi.Bool = True,
+        wi: mi.Vector3f | None = None,
+        wo: mi.Vector3f | None = None,
+    ) -> Query:
+        """All that an evaluation at ``si`` asks of the P-NDF; made once for each.
+
+        ``wi``, ``wo``: local directions between which a facet mirrors; None for any. Where they are
+        given, what ``si`` carries of the half vector's turn and of a light's extent is a part of
+        the query.
+        """
         self.traverse(RefusesDerivatives(self.owner))
-        return Query(self.footprint(si, active))
+        footprint = self.footprint(si, active)
+        carried = Carried.of(si) if self.integrates_lights and wo is not None else None
+        if carried is None:
+            return Query(footprint)
+        # Per UV of the map: H times the inverse of the linear part of to_uv.
+        to_uv = mi.AffineTransform3f(self.to_uv).matrix
+        inverse = dr.rcp(mi.Matrix2f([[to_uv[0, 0], to_uv[0, 1]], [to_uv[1, 0], to_uv[1, 1]]]))
+        return Query(footprint, carried.turn(si) @ inverse, carried.spread(wi, wo))
 
     def warn_of_point_footprint(self) -> None:
         """Say, once, that nothing tells how large a pixel is, and why."""
@@ -272,8 +306,19 @@ class GlintBSDF(FootprintBSDF):
         """Make the P-NDF for queries within ``domain``, or for any."""
         raise NotImplementedError
 
-    def finish(self) -> None:
-        """End a subclass's constructor: build, unless somebody else will."""
+    def finish(self, method: type[PNDF] = PNDF) -> None:
+        """End a subclass's constructor: build, unless somebody else will.
+
+        ``method``: class of the P-NDF, which tells whether it integrates lights.
+        """
+        reflects = all(
+            bool(int(c.flags) & int(mi.BSDFFlags.GlossyReflection))
+            for c in self.interface.components
+        )
+        if method.integrates_lights and reflects:
+            self.integrates_lights = True
+            self.m_components = [flags | INTEGRATES_LIGHTS for flags in self.m_components]
+            self.m_flags |= INTEGRATES_LIGHTS
         if not self.deferred:
             self.build()
         elif self.normal_map is not None:
@@ -396,7 +441,7 @@ class GlintBSDF(FootprintBSDF):
         """``eval_pdf`` of one component."""
         active, wi, wo = component.above_horizon(active, si.wi, wo)
         m = component.half_vector(wi, wo)
-        query = self.query(si, active)
+        query = self.query(si, active, wi, wo)
         pndf, masking = self.facets(ctx, si)
         density = self.density(pndf, m, query, si, active)
         value = component.value(density, wi.z)

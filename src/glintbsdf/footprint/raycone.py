@@ -74,6 +74,21 @@ class RayCone:
             finite_or_zero(tangent_to_uv(si.dp_du, si.dp_dv, dp)) for dp in (self.dp_x, self.dp_y)
         )
 
+    def turned_per_uv(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """How the direction towards the ray's origin changes over the surface at ``si``, per unit
+        of u and of v: the cone's change per pixel, by the UV partials of a pixel that ``si`` has.
+
+        Zero where these are degenerate.
+        """
+        a, b = si.duv_dx, si.duv_dy
+        determinant = a.x * b.y - a.y * b.x
+        known = dr.abs(determinant) > 1e-30
+        inverse = dr.select(known, -dr.rcp(dr.select(known, determinant, 1)), 0)
+        return (
+            (self.dd_x * b.y - self.dd_y * a.y) * inverse,
+            (self.dd_y * a.x - self.dd_x * b.x) * inverse,
+        )
+
     def scattered(
         self,
         si: mi.SurfaceInteraction3f,

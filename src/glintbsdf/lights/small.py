@@ -23,6 +23,9 @@ MOST = 16
 #: Wider ones are found by BSDF sampling as well as by themselves.
 SMALL = 0.25
 
+#: Emitters up to which it pays to look at all of them to save a BSDF sample.
+FEW = 8
+
 #: Rays by which the power of an emitter is estimated.
 POWER_RAYS = 64
 
@@ -70,6 +73,7 @@ class SmallLights:
     Args:
         scene (mi.Scene): the scene.
         every (bool): whether emitters are asked at every hit, :data:`MOST` at most; else none is.
+        extents (bool): whether the lights' extents are of interest; else none is small.
 
     Attributes:
         asked (mi.EmitterPtr): the emitters asked at every hit, ``asked_count`` of them.
@@ -77,16 +81,17 @@ class SmallLights:
             ``sampling_weight``; ``others_count`` of them.
     """
 
-    def __init__(self, scene: mi.Scene, every: bool = True) -> None:
+    def __init__(self, scene: mi.Scene, every: bool = True, extents: bool = True) -> None:
         emitters = scene.emitters()
         pointers = scene.emitters_dr()
         weights = np.array([emitter.sampling_weight() for emitter in emitters])
         bounded = [
             k for k, emitter in enumerate(emitters) if not emitter.is_environment() and weights[k]
         ]
-        asked = most_powerful(emitters, bounded, MOST) if every else []
+        strongest = most_powerful(emitters, bounded, MOST) if every or extents else []
+        asked = strongest if every else []
         others = [k for k in range(len(emitters)) if k not in asked and weights[k]]
-        self.asked_count, self.others_count = len(asked), len(others)
+        self.asked_count, self.others_count, self.extents = len(asked), len(others), extents
 
         def chosen(indices):
             return dr.gather(mi.EmitterPtr, pointers, mi.UInt32(indices)) if indices else None
@@ -100,17 +105,35 @@ class SmallLights:
         size = names.max(initial=0) + 1
         probability, small = np.zeros(size, np.float32), np.zeros(size, bool)
         centre, axes = np.zeros((size, 3), np.float32), np.zeros((size, 3, 3), np.float32)
+        delta = np.array(
+            [bool(emitter.flags() & mi.EmitterFlags.Delta) for emitter in emitters], bool
+        )
         probability[names[asked]] = 1
         probability[names[others]] = weights[others] / max(weights[others].sum(), 1e-30)
-        for k in asked:
+        for k in strongest if extents else []:
             found = extent(emitters[k])
             if found is not None:
                 small[names[k]] = True
                 centre[names[k]], axes[names[k]] = found
         self.probability = mi.Float(probability)
         self.extended = mi.Bool(small)
+        #: Whether all emitters are asked, and all of them may be small: then BSDF sampling finds
+        #: none that emitter sampling does not.
+        self.complete = every and not others and bool(np.all(small[names[asked]] | delta[asked]))
         self.centre = mi.Float(centre.ravel())
         self.axes = mi.Float(axes.ravel())
+
+    def all_small(self, p: mi.Point3f) -> mi.Bool:
+        """Where, seen from ``p``, no emitter is left for BSDF sampling: all are small or points."""
+        if not self.complete or self.asked_count > FEW:
+            return mi.Bool(False)
+        result = mi.Bool(True)
+        for k in range(self.asked_count):
+            emitter = dr.gather(mi.EmitterPtr, self.asked, mi.UInt32(k))
+            name = self.name(emitter)
+            extended = dr.gather(mi.Bool, self.extended, name)
+            result &= self.view(emitter, p).small | ~extended
+        return result
 
     def name(self, emitter: mi.EmitterPtr) -> mi.UInt32:
         """The number by which an emitter is looked up; 0 where there is none."""

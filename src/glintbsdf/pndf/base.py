@@ -65,6 +65,10 @@ class PNDF(ABC):
     #: The maskings that :meth:`masking` can make, the default one first.
     maskings: ClassVar[tuple[str, ...]] = ("beckmann", "none")
 
+    #: Whether D is averaged over the ``spread`` of a query, and its half vector turns: lights of
+    #: some extent are then integrated by the P-NDF.
+    integrates_lights: ClassVar[bool] = False
+
     #: Parameters on which the roughness of the whole depends.
     roughness_keys: ClassVar[tuple[str, ...]] = ("data", "sigma_r")
 
@@ -97,6 +101,10 @@ class PNDF(ABC):
             return dict(build())
         content = () if self.normal_map is None else (self.normal_map.content_hash,)
         return load_or_build(build, *content, *parameters)
+
+    def prepare_for_lights(self) -> None:
+        """Make what queries with a spread need, where that is not there yet. Nothing can be made
+        while a kernel is recorded, so whoever will ask such queries calls this before."""
 
     #: Whether parameters have been changed since the construction.
     changed: bool = False

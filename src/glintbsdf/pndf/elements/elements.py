@@ -40,6 +40,7 @@ from glintbsdf.microfacet.mean_plane import (
     variance_along,
 )
 from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.elements.levels import Levels
 from glintbsdf.pndf.filters.filters import COVARIANCE
 from glintbsdf.pndf.filters.moments import MomentPyramid, level_sigma
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
@@ -59,6 +60,10 @@ MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
 
 #: Seeds per cell along an axis, at most: the loop over those of a cell is unrolled.
 MAX_SEEDS = 4
+
+#: Variance of spread and turning normals, over that of an element's normals, up to which the lists
+#: of elements serve: 1 to 2 % of the mass is beyond their reach then (measured).
+LISTS_SPREAD = 1.6
 
 #: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
 #: takes 430 of its 1120 MB then at a step of half a texel, and 170 at one texel.
@@ -181,11 +186,16 @@ class Mixture(PNDF):
     #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
     point_cut = 4.0
 
+    #: Merged elements, for spread normals; None where they have not been asked for.
+    levels: Levels | None = None
+
     #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
     origin: tuple[float, ...] = (0.0, 0.0)
 
-    def lobes(self, kernel: TexelKernel) -> Callable:
+    def lobes(self, kernel: TexelKernel, query: Query | None = None) -> Callable:
         """What the footprint makes of elements, as a function ``(row, column, corner, active)``.
+
+        Normals spread, and the half vector turns, as ``query`` says; without one they do not.
 
         It lists the elements of a stored cell, whose ``corner`` is given from the footprint's
         centre (cells): of each its area (cells), ρ² of its place, and of its normals a projected
@@ -206,6 +216,13 @@ class Mixture(PNDF):
     def mass(self, kernel: TexelKernel) -> mi.Float:
         """W: mass of all elements under a large footprint, without a cut."""
         raise NotImplementedError
+
+    def turn_per_cell(self, query: Query) -> mi.Matrix2f | None:
+        """H of a query in the units of positions."""
+        if query.turn is None:
+            return None
+        columns, rows = self.map_cells
+        return query.turn @ mi.Matrix2f([[1 / columns, 0], [0, 1 / rows]])
 
     def draw_seed(self, position, random_x, random_y, active) -> tuple:
         """Draw an element in proportion to its Gaussian at ``position`` (cells).
@@ -302,7 +319,7 @@ class Mixture(PNDF):
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it."""
         kernel, few, cut = self.weights(query)
-        lobes = self.lobes(kernel)
+        lobes = self.lobes(kernel, query)
         active = active & (dr.squared_norm(m) < 1)
 
         def seen(*cell):
@@ -330,13 +347,35 @@ class Mixture(PNDF):
             return sums + dr.select(cell[-1], total, 0)
 
         density, mass = self.sum_all(kernel, add_both, active & few, mi.Vector2f(0))
+        coarse = self.asked_coarsely(query, few)
         if self.lists is not None:
-            listed = active & ~few & self.lists.covers(m)
+            listed = active & ~few & ~coarse & self.lists.covers(m)
             density = density + self.lists.visit(m, kernel, add, listed)
         gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
         gaussian = gaussian * mass_under_fade(cut)
         mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
-        return density / mass
+        density = density / mass
+        if self.levels is not None and (query.spread or query.turn is not None):
+            of_levels = self.levels.eval(m, query, dr.square(self.sigma_r), active & coarse)
+            density = dr.select(coarse, of_levels, density)
+        return density
+
+    def asked_coarsely(self, query: Query, few: mi.Bool) -> mi.Bool:
+        """Where the coarse elements are to answer, as normals spread, or the half vector turns,
+        further than the lists of elements reach; but not where all of ``few`` are summed."""
+        if self.levels is None:
+            return mi.Bool(False)
+        variance = mi.Float(0)
+        for v in query.spread:
+            variance = variance + dr.squared_norm(v)
+        if query.turn is not None:
+            footprint = query.footprint
+            for axis in (footprint.du, footprint.dv):
+                variance = variance + dr.squared_norm(query.turn @ axis)
+        # Of both directions together
+        curved = 0.5 * self.levels.slope**2 * self.variance / SIGMA_H**2
+        own = dr.square(self.sigma_r) + dr.opaque(mi.Float, curved)
+        return ~few & (variance > 2 * LISTS_SPREAD * own)
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
@@ -374,11 +413,15 @@ class Mixture(PNDF):
                 "element",
             )
         normal, jacobian = self.element(x, y, active)
-        mean, distribution = normal, Gaussian(variance=dr.square(self.sigma_r))
-        if jacobian is not None:
+        mean, distribution = normal, Gaussian(query.spread, dr.square(self.sigma_r))
+        turn = self.turn_per_cell(query)
+        if jacobian is not None or turn is not None:
             overlap = self.overlap(kernel)
-            mean = normal - jacobian @ overlap.mean(offset)
-            distribution = overlap.normals(jacobian, distribution)
+            moved = less(jacobian, turn)
+            mean = normal - moved @ overlap.mean(offset)
+            if turn is not None:
+                mean = mean - turn @ offset
+            distribution = overlap.normals(moved, distribution)
         random = pcg3d(bits[0], bits[1], bits[2] + 3 * count + 2)
         z = mi.warp.square_to_std_normal(mi.Point2f(uniform(random[0]), uniform(random[1])))
         return mean + distribution.sample(mi.Vector2f(z))
@@ -394,6 +437,8 @@ class Mixture(PNDF):
         """Memory of each part of the structure, bytes."""
         lists = 0 if self.lists is None else self.lists.nbytes
         parts = {"elements": self.element_bytes, "lists of elements": lists}
+        if self.levels is not None:
+            parts["merged elements"] = self.levels.nbytes
         if self.slopes is not None:
             parts[f"masking, MIP levels {self.slopes.first} to {self.slopes.top}"] = (
                 self.slopes.nbytes
@@ -449,6 +494,7 @@ class Elements(Mixture):
     """
 
     normal_map: NormalMap
+    integrates_lights = True
 
     def __init__(
         self,
@@ -501,6 +547,7 @@ class Elements(Mixture):
         self.anchors = self.places
         if self.aligned and self.curved:
             self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
+        self.levels = None
         self.lists = None
         if domain is None or not self.all_small(domain.largest):
             arrays = self.cached(self.build_lists, self.sigma_r[0], self.step, self.curved)
@@ -541,6 +588,10 @@ class Elements(Mixture):
         rows, columns = self.texels.y, self.texels.x
         normals = self.corner_normals(rows.locate(row)[1], columns.locate(column)[1], active)
         return frame_in_quad(u.x - column, u.y - row, normals, 0.0)
+
+    def prepare_for_lights(self) -> None:
+        if self.levels is None:
+            self.levels = Levels(self.data, self.wrap_mode)
 
     def all_small(self, sigma: float) -> bool:
         """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
@@ -596,8 +647,9 @@ class Elements(Mixture):
             return [(normal_at(normals, *place), None) for place in self.places]
         return [(normals[ANCHORS[side][1]], jacobians[side]) for side in sides]
 
-    def lobes(self, kernel):
-        roughness = Gaussian(variance=dr.square(self.sigma_r))
+    def lobes(self, kernel, query=None):
+        roughness = Gaussian(query.spread if query else (), dr.square(self.sigma_r))
+        turn = self.turn_per_cell(query) if query else None
         overlap = self.overlap(kernel)
         area = 1 / len(self.places)
         # What does not depend on the cell.
@@ -615,8 +667,16 @@ class Elements(Mixture):
                 if jacobian is not None:
                     # s_i + J μ: the normal is that of the anchor, and μ = −S T⁻¹ offset.
                     shift = -(jacobian @ (step + steps[k]))
-                    if jacobian is not of:
-                        distribution, of = overlap.normals(jacobian, roughness), jacobian
+                if turn is not None:
+                    # The half vector where the footprint sees the element, offset + μ away.
+                    place = mi.Vector2f(*self.places[k])
+                    turned = turn @ (corner + place - step - overlap.gain @ place)
+                    shift = -turned if shift is None else shift - turned
+                if (jacobian is not None or turn is not None) and (
+                    jacobian is not of or distribution is roughness
+                ):
+                    of = jacobian
+                    distribution = overlap.normals(less(jacobian, turn), roughness)
                 near = dr.squared_norm(white_corner + whitened[k])
                 yield area, near, normal, shift, distribution
 
@@ -736,6 +796,13 @@ class Elements(Mixture):
 #: By the side of a quad's diagonal: a corner at which the mesh has the normal that a Jacobian there
 #: begins from, as a place and as an index.
 ANCHORS = {0.0: ((0, 0), 0), 0.5: ((1, 0), 1), 1.0: ((1, 1), 3)}
+
+
+def less(jacobian: mi.Matrix2f | None, turn: mi.Matrix2f | None) -> mi.Matrix2f:
+    """J − H."""
+    if turn is None:
+        return jacobian
+    return -turn if jacobian is None else jacobian - turn
 
 
 def side_of_diagonal(x, y):

@@ -22,13 +22,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import floor_int
+from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap
 
 #: Squared Mahalanobis distance from the footprint's centre at which elements are cut, and the width
 #: over which they fade until there.
-CUT, FADE = 8.0, 2.0
+CUT, FADE = 10.0, 2.0
 
 #: Cells that a footprint's minor standard deviation spans, about, at the level it is asked at.
 CELLS = 2.0
@@ -42,7 +44,14 @@ TAPS = 4.0
 #: Standard deviations beyond the map's normals where nothing is left.
 REACH = 4.5
 
-NUMBERS = 9  # of an element: mean 2, Jacobian 4, residual covariance 3
+#: Variance of normals added to what merged elements leave, well above its rounding errors.
+ROUNDING = 1e-7
+
+#: Components of a symmetric matrix.
+PAIRS = (0, 0), (0, 1), (1, 1)
+
+#: Floats of an element: mean 2, Jacobian 4, root of the residual covariance 3.
+NUMBERS = 9
 
 
 @dataclass
@@ -65,7 +74,7 @@ class Raw:
 
 
 class Levels:
-    """The coarse elements of a map, levels 1 and up, each stored as :data:`NUMBERS` floats.
+    """The coarse elements of a map, from one per texel upwards; :data:`NUMBERS` floats for each.
 
     Args:
         data (mi.TensorXf): projected normals, H×W×2; derivatives flow through it.
@@ -111,30 +120,27 @@ class Levels:
         """The level to ask, as an index, for a footprint (in texels) and a spread of normals, its
         standard deviation: cells about as wide as either allows."""
         by_footprint = dr.sqrt(kernel.minor_variance) * (1 / CELLS)
-        by_spread = spread * dr.opaque(mi.Float, DETAIL / (SIGMA_H * self.slope))
+        by_spread = spread * dr.opaque(mi.Float, DETAIL / self.slope)
         level = dr.round(dr.log2(dr.maximum(by_footprint, by_spread)))
         return mi.UInt32(dr.clip(level, 0, self.count - 1))
 
     def eval(
         self,
         m: mi.Vector2f,
-        footprint,
+        query: Query,
         variance: mi.Float,
-        spread: tuple,
-        turn: mi.Matrix2f | None,
         active: mi.Bool,
     ) -> mi.Float:
         """The density of the projected normal ``m``.
 
         Args:
-            footprint: in the UV space of the map.
+            query: with a footprint in the UV space of the map.
             variance: of the normals of a flat place, in every direction.
-            spread: ``mi.Vector2f`` whose outer products are added to it.
-            turn: of the half vector, per UV.
         """
+        footprint, turn = query.footprint, query.turn
         height, width = self.texels.y, self.texels.x
         kernel = TexelKernel("gaussian", footprint, height, width, self.wrap_mode, (0.0, 0.0))
-        rough = Gaussian(spread, variance)
+        rough = Gaussian(query.spread, variance)
         widest = dr.sqrt(dr.maximum(rough.xx, rough.yy))
         level = self.level_for(kernel, dr.sqrt(dr.sqrt(rough.determinant)))
         columns = dr.gather(mi.Int, self.columns, level, active)
@@ -170,8 +176,8 @@ class Levels:
             inside = active & (x <= right)
             weight = dr.clip((CUT - dr.squared_norm(kernel.whitened(d))) * (1 / FADE), 0, 1)
             weight = dr.select(inside, weight * overlap.mass(d), 0)
-            column, flip_x = self.wrapped(x, columns)
-            line, flip_y = self.wrapped(y, rows)
+            column, flip_x = wrapped(x, columns, self.wrap_mode)
+            line, flip_y = wrapped(y, rows, self.wrap_mode)
             index = offset + mi.UInt32(line * columns + column)
             e = [dr.gather(mi.Float, self.table, NUMBERS * index + k, inside) for k in range(9)]
             jacobian = mi.Matrix2f(e[2] * flip_x, e[4] * flip_y, e[3] * flip_x, e[5] * flip_y)
@@ -194,28 +200,13 @@ class Levels:
 
         top = -floor_int(-mean.y + kernel.reach_v)
         left, right = row(top)
-        *_, density, mass = dr.while_loop(
+        *_, density, mass = symbolic_loop(
             (left, right, top, active & (top <= bottom), mi.Float(0), mi.Float(0)),
             lambda *state: state[3],
             body,
-            max_iterations=-1,
-            label="coarse elements",
+            "coarse elements",
         )
         return density / dr.select(mass > 0, mass, 1)
-
-    def wrapped(self, index: mi.Int, count: mi.Int) -> tuple[mi.Int, mi.Float]:
-        """The element that stands at any index along an axis of ``count``, and the sign of its
-        derivatives along it."""
-        if self.wrap_mode == "clamp":
-            inside = (index >= 0) & (index < count)
-            return dr.clip(index, 0, count - 1), dr.select(inside, mi.Float(1), 0)
-        if self.wrap_mode == "repeat":
-            turns = floor_int((mi.Float(index) + 0.5) / mi.Float(count))
-            return index - turns * count, mi.Float(1)
-        turns = floor_int((mi.Float(index) + 0.5) / mi.Float(2 * count))
-        index = index - turns * 2 * count
-        beyond = index >= count
-        return dr.select(beyond, 2 * count - 1 - index, index), dr.select(beyond, mi.Float(-1), 1)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -223,43 +214,45 @@ class Levels:
 # ------------------------------------------------------------------------------------------------
 
 
-def wrap(index: np.ndarray, count: int, wrap_mode: str) -> tuple[np.ndarray, np.ndarray]:
-    """The stored places that stand at ``index``, and the signs of their derivatives."""
+def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int, mi.Float]:
+    """The element that stands at any index along an axis of ``count``, and the sign of its
+    derivatives along it."""
     if wrap_mode == "clamp":
-        return np.clip(index, 0, count - 1), np.where((index >= 0) & (index < count), 1.0, 0.0)
+        inside = (index >= 0) & (index < count)
+        return dr.clip(index, 0, count - 1), dr.select(inside, mi.Float(1), 0)
+    period = count if wrap_mode == "repeat" else 2 * count
+    index = index - floor_int((mi.Float(index) + 0.5) / mi.Float(period)) * period
     if wrap_mode == "repeat":
-        return index % count, np.ones(index.shape)
-    index = index % (2 * count)
+        return index, mi.Float(1)
     beyond = index >= count
-    return np.where(beyond, 2 * count - 1 - index, index), np.where(beyond, -1.0, 1.0)
+    return dr.select(beyond, period - 1 - index, index), dr.select(beyond, mi.Float(-1), 1)
 
 
 def texels(data: mi.TensorXf, wrap_mode: str) -> Raw:
     """Level 0: one element per texel, whose Jacobian is that of central differences."""
     height, width, _ = data.shape
-    index = dr.arange(mi.UInt32, width * height)
-    n = [dr.gather(mi.Float, data.array, 2 * index + k) for k in (0, 1)]
-    rows, columns = np.divmod(np.arange(width * height), width)
+    index = dr.arange(mi.Int, width * height)
+    pitch = dr.opaque(mi.Int, width)
+    row = index // pitch
+    column = index - row * pitch
 
-    def difference(channel, along_x):
-        places = []
-        for step in (1, -1):
-            if along_x:
-                places.append(rows * width + wrap(columns + step, width, wrap_mode)[0])
-            else:
-                places.append(wrap(rows + step, height, wrap_mode)[0] * width + columns)
-        after, before = (
-            dr.gather(mi.Float, channel, mi.UInt32(place.astype(np.uint32))) for place in places
-        )
-        return 0.5 * (after - before)
+    def normals(row, column):
+        place = mi.UInt32(2 * (row * pitch + column))
+        return [dr.gather(mi.Float, data.array, place + k) for k in (0, 1)]
 
+    def difference(before, after):
+        return [0.5 * (b - a) for a, b in zip(before, after, strict=True)]
+
+    lines, columns = dr.opaque(mi.Int, height), pitch
+    left, right = (wrapped(column + step, columns, wrap_mode)[0] for step in (-1, 1))
+    above, below = (wrapped(row + step, lines, wrap_mode)[0] for step in (-1, 1))
+    n = normals(row, column)
+    jx = difference(normals(row, left), normals(row, right))
+    jy = difference(normals(above, column), normals(below, column))
     variance = SIGMA_H**2
-    jx, jy = ([difference(channel, along_x) for channel in n] for along_x in (True, False))
-    nn = [
-        n[i] * n[j] + variance * (jx[i] * jx[j] + jy[i] * jy[j])
-        for i, j in ((0, 0), (0, 1), (1, 1))
-    ]
+    nn = [n[i] * n[j] + variance * (jx[i] * jx[j] + jy[i] * jy[j]) for i, j in PAIRS]
     nx, ny = ([variance * j for j in js] for js in (jx, jy))
+    dr.eval(n, nx, ny, nn)
     return Raw(n, nx, ny, nn, (width, height), (1.0, 1.0))
 
 
@@ -271,41 +264,44 @@ def merged(raw: Raw, axis: int, wrap_mode: str) -> Raw:
     new_count = ceil(count / 2)
     ratio = count / new_count
     variance = SIGMA_H**2 * (ratio**2 - 1)  # of the taps, in elements
-    centre = (np.arange(new_count) + 0.5) * ratio - 0.5
     reach = ceil(TAPS * sqrt(variance))
-    offsets = np.arange(-reach, reach + 2)
-    places = np.floor(centre)[:, None].astype(int) + offsets
-    distance = places - centre[:, None]
-    weight = np.exp(-0.5 * distance**2 / variance)
-    weight /= weight.sum(1, keepdims=True)
-    stored, sign = wrap(places, count, wrap_mode)
-
     columns, rows = raw.counts
     new_counts = (new_count, rows) if axis == 0 else (columns, new_count)
-    index = np.arange(new_counts[0] * new_counts[1])
-    row, column = np.divmod(index, new_counts[0])
+
+    index = dr.arange(mi.Int, new_counts[0] * new_counts[1])
+    pitch, old_pitch = dr.opaque(mi.Int, new_counts[0]), dr.opaque(mi.Int, columns)
+    row = index // pitch
+    column = index - row * pitch
     along = column if axis == 0 else row
+    # Opaque, so that one kernel serves many levels.
+    ratio_, size = dr.opaque(mi.Float, ratio), dr.opaque(mi.Int, count)
+    sharpness = dr.opaque(mi.Float, 0.5 / variance)
+    step = dr.opaque(mi.Float, spacing)
+    centre = dr.fma(mi.Float(along) + 0.5, ratio_, -0.5)
+    first = floor_int(centre)
+    total = mi.Float(0)
     zero = mi.Float(0)
     n, nx, ny, nn = [zero] * 2, [zero] * 2, [zero] * 2, [zero] * 3
-    for k in range(len(offsets)):
-        place = stored[along, k]
-        source = row * columns + place if axis == 0 else place * columns + column
-        source = mi.UInt32(source.astype(np.uint32))
-        w, d, s = (
-            mi.Float(values[along, k].astype(np.float32))
-            for values in (weight, distance * spacing, sign)
+    for k in range(-reach, reach + 2):
+        place, sign = wrapped(first + k, size, wrap_mode)
+        distance = mi.Float(first + k) - centre
+        weight = dr.exp(-sharpness * dr.square(distance))
+        source = row * old_pitch + place if axis == 0 else place * old_pitch + column
+        means, about_x, about_y, products = (
+            [dr.gather(mi.Float, channel, mi.UInt32(source)) for channel in channels]
+            for channels in (raw.n, raw.nx, raw.ny, raw.nn)
         )
-
-        def taken(channels, source=source):
-            return [dr.gather(mi.Float, channel, source) for channel in channels]
-
-        means, about_x, about_y, products = map(taken, (raw.n, raw.nx, raw.ny, raw.nn))
         turned = about_x if axis == 0 else about_y
-        turned[:] = [t * s + d * mean for t, mean in zip(turned, means, strict=True)]
+        turned[:] = [
+            dr.fma(t, sign, distance * step * mean) for t, mean in zip(turned, means, strict=True)
+        ]
         n, nx, ny, nn = (
-            [dr.fma(w, value, total) for value, total in zip(values, totals, strict=True)]
+            [dr.fma(weight, value, total) for value, total in zip(values, totals, strict=True)]
             for values, totals in ((means, n), (about_x, nx), (about_y, ny), (products, nn))
         )
+        total = total + weight
+    scale = dr.rcp(total)
+    n, nx, ny, nn = ([value * scale for value in values] for values in (n, nx, ny, nn))
     dr.eval(n, nx, ny, nn)
     new_spacing = spacing * ratio
     spacings = (new_spacing, raw.spacing[1]) if axis == 0 else (raw.spacing[0], new_spacing)
@@ -320,12 +316,13 @@ def central(raw: Raw) -> mi.Float:
     jy = [v * (1 / (variance * raw.spacing[1])) for v in raw.ny]
     xx, xy, yy = (
         product - raw.n[i] * raw.n[j] - variance * (jx[i] * jx[j] + jy[i] * jy[j])
-        for product, (i, j) in zip(raw.nn, ((0, 0), (0, 1), (1, 1)), strict=True)
+        for product, (i, j) in zip(raw.nn, PAIRS, strict=True)
     )
-    # Rounding must not make it indefinite.
-    a = dr.sqrt(dr.maximum(xx, 1e-12))
+    # Differences of numbers up to 1 keep no more digits than that: a covariance of rounding errors
+    # alone must not be divided by itself.
+    a = dr.sqrt(dr.maximum(xx, 0) + ROUNDING)
     b = xy / a
-    c = dr.sqrt(dr.maximum(yy - b * b, 1e-12))
+    c = dr.sqrt(dr.maximum(yy - b * b, 0) + ROUNDING)
     count = raw.counts[0] * raw.counts[1]
     table = dr.zeros(mi.Float, NUMBERS * count)
     index = dr.arange(mi.UInt32, count)
