@@ -154,8 +154,7 @@ def test_stretched_facets_keep_the_contract(variant, plugin, options):
     suite.check_horizon(bsdf, STRETCHED, 200)
     suite.check_finite(bsdf, STRETCHED)
     suite.check_furnace(bsdf, STRETCHED, count=5000)
-    if options.get("method") != "leadr":
-        suite.check_adjoint(bsdf, STRETCHED)
+    suite.check_adjoint(bsdf, STRETCHED)
 
 
 @pytest.mark.parametrize(
