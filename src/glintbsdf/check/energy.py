@@ -99,10 +99,10 @@ def traced_energy(
     wi = mi.Vector3f(
         np.float32([sine * np.cos(phi), sine * np.sin(phi), np.full(rays, np.cos(theta))])
     )
-    place = np.float32(rng.uniform(0, surface.size, (2, rays)))
+    place = rng.uniform(0, surface.size, (2, rays)).astype(np.float32)
     aim = mi.Point3f(mi.Float(place[0]), mi.Float(place[1]), 0)
     si = scene.ray_intersect(mi.Ray3f(aim + wi * (top / float(np.cos(theta))), -wi))
-    facing = dr.dot(si.n, wi)
+    facing = dr.dot(mi.Vector3f(si.n), wi)
     wo = 2 * facing * mi.Vector3f(si.n) - wi
     leaves = si.is_valid() & (facing > 0) & (wo.z > 0)
     ray = si.spawn_ray(wo)
@@ -136,7 +136,7 @@ def energies(
     si.duv_dx, si.duv_dy = mi.Vector2f(sigma / texels, 0), mi.Vector2f(0, sigma / texels)
     si.t, si.n, si.sh_frame = 1, mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    u = np.float32(rng.random((3, places * samples)))
+    u = rng.random((3, places * samples)).astype(np.float32)
     _, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(u[0]), mi.Point2f(u[1:]))
     weight = np.array(weight[0], np.float64).reshape(places, samples)
     return weight.mean(axis=1), weight.std(axis=1) / np.sqrt(samples)

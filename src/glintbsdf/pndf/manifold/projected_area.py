@@ -388,6 +388,10 @@ class FootprintArea:
         """Memory of each part, besides the mesh, bytes."""
         return {}
 
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Take up new data of the mesh."""
+        raise NotImplementedError
+
 
 class ProjectedArea(FootprintArea):
     """P(ω) of the facets under a footprint, by the sum of Eq. 12.
