@@ -264,11 +264,11 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         if dr.hint(self.max_depth == 0, mode="scalar"):
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
 
-        glints = has_footprints(scene)
-        share = self.share_of_lights(sampler.sample_count()) if glints else 0
+        filters = has_footprints(scene)
+        share = self.share_of_lights(sampler.sample_count()) if filters else 0
         if share > 0:
             prepare_for_lights()
-        lights = SmallLights(scene, self.emitters == "all" and glints, share > 0)
+        lights = SmallLights(scene, self.emitters == "all" and filters, share > 0)
         light_share = dr.opaque(mi.Float, share) if share > 0 else None
         ray_ = self.sized(ray_, sampler.sample_count())
         samples = dr.opaque(mi.Float, sampler.sample_count())
