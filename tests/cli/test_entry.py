@@ -438,7 +438,7 @@ def test_pndf_passes_parameters_on(run, folder):
 
 @pytest.mark.parametrize("extra, message", [
     (["-D", "kernel=gauss"], 'glint_manifold: "kernel" must be one of gaussian, disk, box'),
-    (["-D", "nothing=1"], "unreferenced property"),
+    (["-D", "nothing=1"], '"nothing" is not a parameter'),
     (["--type", "diffuse"], "unreferenced property"),
     (["--sigma", "nan"], "must be"),
     (["-o", "pndf.pdf"], "must end in .exr or .png"),

@@ -467,8 +467,7 @@ def test_bad_parameters(variant, changes, parameter):
 def test_message(variant):
     with pytest.raises(
         Exception,
-        match=r'glint_grid: "detail_alpha_v" must be greater than 0 and '
-        r'at most "alpha_v" = 0.2 \(got 0.25\)',
+        match=r'glint_grid: "detail_alpha_v" must be at most "alpha_v" = 0.2 \(got 0.25\)',
     ):
         load(alpha_v=0.2, detail_alpha_v=0.25)
 
@@ -521,16 +520,16 @@ def test_describes_itself(variant):
 # --------------------------------------------------------------------------------------------------
 
 
-def render(bsdf: dict, integrator: str = "path") -> np.ndarray:
+def render(bsdf: dict, integrator: str = "path", spp: int = 64) -> np.ndarray:
     """A square under a constant sky and a lamp."""
     lights = {
         "sky": {"type": "constant", "radiance": 0.5},
         "lamp": {"type": "point", "position": [0, 1, 2], "intensity": 2.0},
     }
-    return suite.square(bsdf, {"type": integrator, "hide_emitters": True}, lights=lights, spp=64)
+    return suite.square(bsdf, {"type": integrator, "hide_emitters": True}, lights=lights, spp=spp)
 
 
-@pytest.mark.parametrize("integrator", ["path", "direct", "prb", "volpath", "glint_path"])
+@pytest.mark.parametrize("integrator", ["path", "direct", "prb", "volpath"])
 def test_dense_is_roughconductor(variant, integrator):
     glints = describe(density=12.0, footprint_sigma=0.5, pixel_spread=3.6e-3, material="Cu")
     smooth = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3, "material": "Cu"}
@@ -538,6 +537,16 @@ def test_dense_is_roughconductor(variant, integrator):
     # The same random numbers draw the same samples: measured 3e-3, which is roughconductor's
     # masking and the last microdetails' noise.
     assert np.abs(glints - smooth).max() < 0.02 * smooth.mean()
+    assert np.isclose(glints.mean(), smooth.mean(), rtol=4e-3)
+
+
+def test_dense_is_roughconductor_in_glint_path(variant):
+    """It places its samples in the pixels' filter by itself: its noise is not that of ``path``."""
+    glints = describe(density=12.0, footprint_sigma=0.5, material="Cu")
+    smooth = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3, "material": "Cu"}
+    glints, smooth = render(glints, "glint_path", spp=1024), render(smooth, spp=1024)
+    # Measured at 2048 samples: 0.09 at the edge of the square, where both are noisy; 9e-4.
+    assert np.abs(glints - smooth).max() < 0.25 * smooth.mean()
     assert np.isclose(glints.mean(), smooth.mean(), rtol=4e-3)
 
 
