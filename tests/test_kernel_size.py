@@ -46,6 +46,8 @@ def interaction(partials: bool = True) -> mi.SurfaceInteraction3f:
     si.wi = dr.normalize(mi.Vector3f(0.2, 0.1, 1))
     si.duv_dx, si.duv_dy = mi.Vector2f(0.01, 0), mi.Vector2f(0, 0.01)
     dr.make_opaque(si)
+    # Nobody carries a turn of the half vector or a light's extent in these.
+    si.dn_du, si.dn_dv = mi.Vector3f(0), mi.Vector3f(0)
     if not partials:  # as of the integrators of Mitsuba
         si.duv_dx, si.duv_dy = mi.Vector2f(0), mi.Vector2f(0)
     return si
