@@ -54,7 +54,7 @@ class Carried:
         result = mi.SurfaceInteraction3f(si)
         cosine = dr.dot(si.n, si.sh_frame.n)
         oblique = si.sh_frame.n / dr.select(dr.abs(cosine) > 1e-3, cosine, 1)
-        w_u, w_v = (w - oblique * dr.dot(si.n, w) for w in (self.w_u, self.w_v))
+        w_u, w_v = (w - oblique * dr.dot(mi.Vector3f(si.n), w) for w in (self.w_u, self.w_v))
         w_u, w_v = (dr.select(dr.all(dr.isfinite(w)), w, 0) for w in (w_u, w_v))
         result.dn_du = w_u + si.n * dr.log2(dr.maximum(self.variance, NO_VARIANCE))
         result.dn_dv = w_v + si.n * MARK
@@ -66,7 +66,8 @@ class Carried:
         nothing. Lanes that turn out to carry nothing have no turn and a variance of 0."""
         if all(is_literal_zero(x) for x in si.dn_dv):
             return None
-        mark, logarithm = dr.dot(si.n, si.dn_dv), dr.dot(si.n, si.dn_du)
+        normal = mi.Vector3f(si.n)
+        mark, logarithm = dr.dot(normal, si.dn_dv), dr.dot(normal, si.dn_du)
         present = dr.abs(mark - MARK) < 1e-2
         variance = dr.select(present, dr.exp2(logarithm), 0)
         return Carried(
@@ -124,7 +125,7 @@ def half_vector_turn(
     h = wi + wo
     inverse = dr.rcp(dr.maximum(dr.norm(h), 1e-6))
     m = h * inverse
-    cosine = dr.dot(m, si.sh_frame.n)
+    cosine = dr.dot(m, mi.Vector3f(si.sh_frame.n))
     result = []
     for dwi, dp, dn in ((dwi_du, si.dp_du, si.dn_du), (dwi_dv, si.dp_dv, si.dn_dv)):
         dwo = (wo * dr.dot(wo, dp) - dp) * inverse_distance
