@@ -62,7 +62,7 @@ P-NDF, the distribution of the normals under a pixel's footprint, is then a sum 
 
 where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\mu_i` and
 :math:`C` the mean and covariance of the places at which the footprint sees it, and
-:math:`W = \sum_i w_i`. Sampling draws from exactly this density. Unlike that of
+:math:`W = \sum_i w_i`. Sampling draws from this density, within 1e-3. Unlike that of
 :ref:`glint_manifold <bsdf-glint_manifold>`, it is smooth: roughness :math:`\sigma_r` is part of it.
 
 Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,

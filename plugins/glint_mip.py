@@ -108,7 +108,7 @@ grids are about as wide as itself, so the cost does not depend on its size:
 
 with :math:`t` the weights of linear interpolation between two levels, :math:`w_i` the mass of a
 lobe under the footprint, and :math:`R_i` what its normals vary in one place. Sampling draws from
-exactly this density, and it integrates to one.
+this density, within 1e-3, and it integrates to one.
 
 Of a sample of 256×256 texels made 4096×4096, everything together takes 22 MB. Building it takes
 some 14 seconds of processor time, once: the cache on disk keeps it. The map can be written out with

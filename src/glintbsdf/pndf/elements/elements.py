@@ -7,7 +7,7 @@ their mixture seen through the footprint (Eq. 11), in the stable form of
 :mod:`~glintbsdf.pndf.gaussian_elements`.
 
 Beyond the paper: the mixture is divided by its mass under the footprint, in closed form, so that it
-integrates to one; and the sampler draws from exactly this density.
+integrates to one; and the sampler draws from this density, within the 1e-3 that evaluation cuts.
 """
 
 from __future__ import annotations
