@@ -65,7 +65,6 @@ def test_derivative_in_every_integrator(variant, integrator):
     check_render_derivative(two_sided(bsdf("elements")), "sigma_r", integrator)
 
 
-@pytest.mark.xfail(reason="Dr.Jit refuses forward mode across the recorded loop", strict=False)
 @pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])
 def test_derivative_in_forward_mode(variant, integrator):
     check_render_derivative(
@@ -73,7 +72,6 @@ def test_derivative_in_forward_mode(variant, integrator):
     )
 
 
-@pytest.mark.xfail(reason="its noise at these samples has not been measured", strict=False)
 @pytest.mark.parametrize("integrator", ["path", "glint_path"])
 def test_derivative_of_a_map_in_symbolic_integrators(variant, integrator):
     check_render_derivative(two_sided(bsdf("elements")), "data", integrator)

@@ -498,9 +498,13 @@ def check_render_derivative(
     def derivative(mode: str, seed: int) -> float:
         params[name] = grown(0)
         dr.enable_grad(params[name])
-        if mode == "forward":
-            dr.set_grad(params[name], grown(0))
         params.update()
+        if mode == "forward":
+            # What an update derives from a parameter lies outside of the rendering: it takes its
+            # derivative first, as Mitsuba asks it of everybody who goes forward.
+            dr.set_grad(params[name], grown(0))
+            dr.enqueue(dr.ADMode.Forward, params[name])
+            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
         result = measure(mi.render(scene, params, spp=spp, seed=seed))
         if mode == "forward":
             return float(dr.forward_to(result).array[0])
