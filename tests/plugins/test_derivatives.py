@@ -142,7 +142,8 @@ def test_steps_of_an_optimisation_need_no_new_kernel(variant, name, key):
     start = params[name] + 0
     missed = []
     for step in range(3):
-        params[name] = start * (1 + 0.01 * step)
+        # As optimisers do it: a factor written as a number would be a part of a kernel.
+        params[name] = start * dr.opaque(mi.Float, 1 + 0.01 * step)
         dr.enable_grad(params[name])
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

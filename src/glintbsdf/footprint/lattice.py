@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.opaque import aligned
+
 #: Quads are grouped in square blocks of this side. A power of two.
 BLOCK = 8
 
@@ -121,7 +123,7 @@ class Lattice:
         self.pitch = 8 * tiles[1]  # of a row of tiles
         rows = np.resize(self.y.source, 2 * tiles[0]).reshape(tiles[0], 1, 2, 1)
         columns = np.resize(self.x.source, 4 * tiles[1]).reshape(1, tiles[1], 1, 4)
-        self.source = (rows * width + columns).astype(np.uint32).ravel()
+        self.source = aligned((rows * width + columns).astype(np.uint32).ravel())
 
     @cached_property
     def row_pitch(self) -> mi.UInt32:
