@@ -1,17 +1,28 @@
 """4D Gaussians in position × normal space, seen through a Gaussian footprint.
 
 Yan, Hašan, Marschner and Ramamoorthi, "Position-Normal Distributions for Efficient Rendering of
-Specular Microstructure" (2016), section 5.1 and appendix. A lobe stands at the position u_i with
-the positional covariance S; its normals are s_i + J δu, of covariance R (Eq. 13 has S = σ_h² I and
-R = σ_r² I). Under a footprint N(u_0, Σ_p), with d = u_0 − u_i and T = Σ_p + S,
+Specular Microstructure" (2016), section 5.1 and appendix. A lobe G_i has its mean at the position
+u_i and the normal s_i, and the positional covariance S. At u = u_i + δu its normals have the mean
+s_i + J δu and the covariance R. The paper's elements (Eq. 12 to 14) have S = σ_h² I and R = σ_r² I;
+J is 0 for a flat one. The paper's appendix integrates a lobe under the footprint G_p (Eq. 11):
+
+* Eq. 15 to 18 fix s and rewrite G_i as a 2D Gaussian in u, from blocks of the inverse of its 4×4
+  covariance;
+* Eq. 19 and 20 multiply it by G_p;
+* Eq. 21 integrates the product.
+
+Here the same steps have another order, which is stable: first the product over positions (Eq. 19
+and 20), then the integral (Eq. 21), and the slice at s last. With G_p = N(u_0, Σ_p), d = u_0 − u_i
+and T = Σ_p + S,
 
     N(u; u_0, Σ_p) N(u; u_i, S) = N(d; 0, T) N(u; u_i + μ, C)        μ = S T⁻¹ d,  C = Σ_p T⁻¹ S
-    ∫ N(u; u_0, Σ_p) lobe(u, s) du = N(d; 0, T) N(s; s_i + J μ, R + J C Jᵀ)
+    ∫ N(u; u_0, Σ_p) G_i(u, s) du = N(d; 0, T) N(s; s_i + J μ, R + J C Jᵀ)
 
-The paper's appendix inverts 4×4 matrices with entries like 1/σ_r² and then subtracts: in float32
-nothing is left of stiff lobes. Here nothing large is inverted and nothing is subtracted. All
-covariances are sums of outer products v vᵀ, as the footprint itself is; their determinants and
-quadratic forms are then sums of squares (Cauchy and Binet: |Σ v vᵀ| = Σ_{k<l} (v_k × v_l)²).
+:class:`Overlap` has the first line, :meth:`Overlap.normals` the second. The paper's order inverts
+matrices with entries like 1/σ_r² (Eq. 14) and then subtracts (Eq. 18). In float32 this leaves no
+correct digit for small σ_r. Here nothing large is inverted and nothing is subtracted. All
+covariances are sums of outer products v vᵀ, as the footprint's is. Their determinants and quadratic
+forms are then sums of squares (Cauchy and Binet: |Σ v vᵀ| = Σ_{k<l} (v_k × v_l)²).
 """
 
 from __future__ import annotations
@@ -24,13 +35,13 @@ import mitsuba as mi
 
 from glintbsdf.footprint.kernels import difference_of_products
 
-#: Standard deviation of a seed, in steps of its lattice: neighbours meet at half their height
-#: (Yan et al. 2016, section 4.1).
+#: Standard deviation σ_h of an element's position, in steps of the lattice: neighbours have half
+#: their height midway between them (Yan et al. 2016, section 4.1).
 SIGMA_H = 1 / sqrt(8 * log(2))
 
 
 def exact_cross(a: mi.Vector2f, b: mi.Vector2f) -> mi.Float:
-    """z component of the cross product of two vectors of the plane, without cancellation."""
+    """The cross product a_x b_y − a_y b_x of two plane vectors, without cancellation."""
     return difference_of_products(a.x, b.y, a.y, b.x)
 
 
@@ -42,9 +53,9 @@ class Gaussian:
         variance (float or mi.Float): ≥ 0.
 
     Attributes:
-        xx, xy, yy, determinant (mi.Float): the covariance; the determinant must be > 0 wherever
-            the Gaussian is evaluated.
-        peak (mi.Float): the density's value at 0.
+        xx, xy, yy, determinant (mi.Float): entries and determinant of the covariance; the
+            determinant must be > 0 wherever the Gaussian is evaluated.
+        peak (mi.Float): the density at 0.
     """
 
     def __init__(self, vectors: tuple = (), variance: float | mi.Float = 0.0) -> None:
@@ -72,7 +83,7 @@ class Gaussian:
         return self.peak * dr.exp(-0.5 * self.distance_squared(d))
 
     def root(self) -> tuple[mi.Vector2f, mi.Vector2f]:
-        """Two vectors with the same covariance, (a, b) and (0, c); zero for a covariance of 0."""
+        """Two vectors (a, b) and (0, c) whose outer products add up to the covariance."""
         extended = self.xx > 0
         inverse = mi.Float(dr.select(extended, dr.rsqrt(dr.select(extended, self.xx, 1)), 0))
         # Where xx vanishes so does xy, and the determinant says nothing of yy.
@@ -109,7 +120,7 @@ class Overlap:
         xy = yx = mi.Float(0)
         for v in footprint.vectors:
             across = mi.Vector2f(-v.y, v.x)
-            # S v⊥, v⊥·s being v × s
+            # S v⊥; here v⊥·s = v × s
             image = lobe.variance * across
             for s in lobe.vectors:
                 image = image + exact_cross(v, s) * s
@@ -131,17 +142,17 @@ class Overlap:
         self.root = offset.root()
 
     def mass(self, d: mi.Vector2f) -> mi.Float:
-        """N(d; 0, T): mass of the lobe under the footprint, ``d`` = u_0 − u_i."""
+        """N(d; 0, T): the lobe's mass under the footprint, for ``d`` = u_0 − u_i (Eq. 20)."""
         return self.total.eval(d)
 
     def mean(self, d: mi.Vector2f) -> mi.Vector2f:
-        """μ: mean offset from u_i under the footprint."""
+        """μ: the mean offset from u_i under the footprint (Eq. 19)."""
         return self.gain @ d
 
     def normals(self, jacobian: mi.Matrix2f, roughness: Gaussian) -> Gaussian:
-        """N(·; 0, R + J C Jᵀ): distribution of the lobe's normals about s_i + J μ.
+        """N(·; 0, R + J C Jᵀ): the distribution of the lobe's normals about s_i + J μ (Eq. 21).
 
-        ``jacobian`` is ∂n/∂u in the units of the positions, ``roughness`` stands for R.
+        ``jacobian`` is J = ∂n/∂u in the units of the positions; ``roughness`` has the covariance R.
         """
         return Gaussian(
             tuple(jacobian @ c for c in self.root) + roughness.vectors, roughness.variance
@@ -149,9 +160,10 @@ class Overlap:
 
 
 def lattice_mass(x: mi.Vector2f, xx: mi.Float, xy: mi.Float, yy: mi.Float) -> mi.Float:
-    """W: the sum of N(x − k; 0, T) over all integer vectors k, by Poisson's formula.
+    """W: the sum of N(x − k; 0, T) over all integer vectors k, by Poisson's summation formula.
 
-    The first four frequencies are enough, to 3e-6, for every T = Σ_p + ``SIGMA_H``² I.
+    ``xx``, ``xy``, ``yy`` are the entries of T. Four frequencies are enough, to 3e-6, for every
+    T = Σ_p + ``SIGMA_H``² I.
     """
     mass = mi.Float(1)
     # kᵀ T k and k·x for k = (1, 0), (0, 1), (1, 1), (1, −1)

@@ -176,17 +176,17 @@ def test_levels_of_odd_and_thin_maps(variant):
             assert abs(density.sum() * area - 1) < 0.01, (shape, sigma)
 
 
-def test_wide_spreads_are_asked_coarsely(variant):
+def test_wide_spreads_use_merged_elements(variant):
     """As soon as they are prepared for; a spread within the roughness is not."""
     elements = Elements(procedural.isotropic(64), 0.01)
     elements.prepare_for_lights()
     parts = elements.parts()
     assert parts["merged elements"] > 0
-    few = mi.Bool(False)
+    small = mi.Bool(False)
     for spread, coarse in ((0.005, False), (0.2, True)):
         query = Query(footprint(0.5, 0.5, 8), spread=isotropic(spread))
-        assert elements.asked_coarsely(query, few).numpy()[0] == coarse
-        assert not elements.asked_coarsely(query, ~few).numpy()[0]
+        assert elements.uses_merged(query, small).numpy()[0] == coarse
+        assert not elements.uses_merged(query, ~small).numpy()[0]
     elements.build()
     assert "merged elements" not in elements.parts()
 

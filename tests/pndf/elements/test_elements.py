@@ -17,7 +17,7 @@ from glintbsdf.core.tuning import tuning
 from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
 from glintbsdf.pndf import Elements, Flakes
 from glintbsdf.pndf.elements import elements
-from glintbsdf.pndf.elements.flakes import EVEN
+from glintbsdf.pndf.elements.flakes import MIN_SIGMA_OF_LISTS
 from glintbsdf.pndf.gaussian_elements import SIGMA_H
 
 MAP = maps.isotropic(48, seed=1)
@@ -260,13 +260,13 @@ def test_no_gap_between_flakes_is_out_of_reach():
 
 
 def test_balanced_flakes_cover_evenly(variant):
-    """From EVEN mean distances on, their mass is one within 1e-3; equal areas leave 5 %."""
+    """Under footprints of MIN_SIGMA_OF_LISTS mean distances, the flakes' mass is 1 within 1e-3."""
     count = 3000
     places = poisson_disk(count, np.random.default_rng(1))
     n, areas = cells_for(count), balanced_areas(places)
     row, column = np.nonzero(areas)
     position = (places[row, column] + np.stack([column, row], 1)).astype(np.float64)
-    sigma = EVEN * n / np.sqrt(count)
+    sigma = MIN_SIGMA_OF_LISTS * n / np.sqrt(count)
     x = np.random.default_rng(2).random((500, 2)) * n
     d = x[:, None] - position[None]
     d -= n * np.round(d / n)

@@ -2,12 +2,13 @@
 
 Yan, Hašan, Marschner and Ramamoorthi, "Position-Normal Distributions for Efficient Rendering of
 Specular Microstructure" (2016), section 5. Seeds on a lattice of step h carry Gaussians in
-position × normal space, flat (Eq. 12) or aligned with the map's curvature (Eq. 13); the P-NDF is
-their mixture seen through the footprint (Eq. 11), in the stable form of
-:mod:`~glintbsdf.pndf.gaussian_elements`.
+position × normal space. An element is flat (Eq. 12), or it follows the map's Jacobian (Eq. 13 and
+14). The P-NDF is their mixture, seen through the footprint (Eq. 11). The integral of one element
+(Eq. 15 to 21) is in :mod:`~glintbsdf.pndf.gaussian_elements`.
 
-Beyond the paper: the mixture is divided by its mass under the footprint, in closed form, so that it
-integrates to one; and the sampler draws from this density, within the 1e-3 that evaluation cuts.
+Beyond the paper: the mixture is divided by its mass under the footprint, which has a closed form,
+so that it integrates to one. The sampler draws from this density, within the 1e-3 that evaluation
+cuts.
 """
 
 from __future__ import annotations
@@ -51,54 +52,62 @@ from glintbsdf.pndf.manifold.projected_area import mean_over_points
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
-#: what large footprints skip: small ones sum without a cut.
+#: large footprints cut them: the lists hold the elements within this distance.
 NORMAL_REACH = 3.94
 
-#: Bounds of the roughness. Half vectors in float32 are 6e-8 apart: below 1e-7 there is only noise,
-#: and determinants underflow from 1e-9 on.
+#: Bounds of the roughness. Half vectors in float32 are 6e-8 apart, so that a roughness below 1e-7
+#: shows only their rounding. From 1e-9 on, determinants underflow.
 MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
 
-#: Seeds per cell along an axis, at most: the loop over those of a cell is unrolled.
+#: Largest number of seeds per cell along an axis: the loop over the seeds of a cell is unrolled.
 MAX_SEEDS = 4
 
-#: Variance of spread and turning normals, over that of an element's normals, up to which the lists
-#: of elements serve: 1 to 2 % of the mass is beyond their reach then (measured).
+#: The lists of elements serve while the variance that the light's spread and the half vector's turn
+#: add is at most this multiple of the variance of an element's own normals. The lists then miss 1
+#: to 2 % of the mass.
 LISTS_SPREAD = 1.6
 
-#: Memory allowed to the lists, bytes per cell with one seed, or with several: the paper's 2048² map
-#: takes 430 of its 1120 MB then at a step of half a texel, and 170 at one texel.
+#: Memory allowed to the lists, in bytes per cell: with one seed per cell, and with several. The
+#: whole structure then takes less memory than the paper reports.
 BYTES_PER_CELL = 42, 96
 
-#: Finest level of the chain of the slopes' moments, which then takes a tenth of the lists. Narrower
-#: footprints are seen by points of the map.
+#: Finest level of the pyramid of slope moments. It then takes a tenth of the memory of the lists.
+#: Narrower footprints are integrated by points of the map.
 FIRST_LEVEL = 7
 
-#: Attempts of the sampler. On a lattice nine in ten succeed, in a gap between flakes a few in 100.
+#: Largest number of attempts of the rejection sampler. On a lattice nine in ten succeed, in a gap
+#: between flakes a few in a hundred.
 MAX_ATTEMPTS = 128
 
 
-#: Elements fade in ρ², the squared Mahalanobis distance from the footprint's centre in N(0, T),
-#: over this width until they are cut.
+#: The weight of an element falls linearly to 0 over this width of ρ², up to the cut. ρ² is the
+#: squared Mahalanobis distance from the footprint's centre in N(0, T).
 FADE = 2.0
 
 
 def cut_of_sums(sigma: mi.Float, point_cut: float) -> mi.Float:
-    """ρ² of the cut where all elements are summed, and with them W: any cut keeps ∫D = 1.
+    """ρ² of the cut where a sum over all elements gives D and its mass W.
 
-    ``sigma`` is the minor standard deviation of T, in steps. A large footprint is cut as that of
-    other kernels, half of the fade within 3 standard deviations, half beyond; a point at
-    ``point_cut``.
+    Any cut keeps ∫D = 1 here. A large footprint is cut like other kernels: half of the fade lies
+    within 3 standard deviations, and half beyond. A point is cut at ``point_cut``.
+
+    Args:
+        sigma: minor standard deviation of T, in steps of the lattice.
+        point_cut: ρ² of the cut for a footprint that is a point.
     """
     return 10 + (point_cut - 10) * SIGMA_H**2 / dr.square(sigma)
 
 
 def cut_of_lists(sigma: mi.Float) -> mi.Float:
-    """ρ² of the cut where W is known in closed form: its ripple stays below 5e-4."""
+    """ρ² of the cut where the mass W has a closed form: W then ripples by less than 5e-4.
+
+    ``sigma``: minor standard deviation of T, in steps of the lattice.
+    """
     return 10 + 3.5 * dr.maximum(dr.log2(2.5 / sigma), 0)
 
 
 def mass_under_fade(cut: mi.Float) -> mi.Float:
-    """What is left of a Gaussian that fades until it is cut at ρ² = ``cut``."""
+    """The mass of a Gaussian that fades to 0 at ρ² = ``cut``, relative to the whole Gaussian."""
     return 1 - dr.exp(-0.5 * cut) * ((exp(0.5 * FADE) - 1) * (2 / FADE))
 
 
@@ -106,14 +115,14 @@ class SeedAxis:
     """Seeds along one axis of a map of ``texels`` texels, about ``step`` texels apart.
 
     Seeds are grouped in cells. Where a whole number of steps makes a texel, a cell is the span
-    between two texel centres, which all its seeds interpolate; else it is a step with one seed.
-    The step is rounded so that a whole number of cells makes the map.
+    between two texel centres, and all its seeds interpolate between these two. Otherwise a cell is
+    one step and has one seed. The step is rounded so that a whole number of cells makes the map.
 
     Attributes:
         seeds (int): seeds per cell.
         cells (int): cells per map.
         cell (float): side of a cell, texels. Cell k begins k sides after the first texel's centre.
-        offset (float): the first seed's place in a cell, in cells.
+        offset (float): position of the first seed in a cell, in cells.
     """
 
     def __init__(self, texels: int, step: float) -> None:
@@ -123,27 +132,29 @@ class SeedAxis:
         self.seeds = per_texel if aligned else 1
         self.cells = texels if aligned else max(1, round(texels / step))
         self.cell = texels / self.cells
-        # One seed to a texel or less: midway between texel centres, where bilinear interpolation
-        # has no kink.
+        # With at most one seed per texel, seeds stand midway between texel centres, where the
+        # interpolation has no kink.
         self.offset = 0.5 / self.seeds if self.cell <= 1 else 0.5 / self.cell
 
     @property
     def places(self) -> list[float]:
-        """Places of the seeds in a cell."""
+        """Positions of the seeds in a cell, in cells."""
         return [self.offset + k / self.seeds for k in range(self.seeds)]
 
     @property
     def inner_cells(self) -> int:
-        """Cells of a clamped map: those that begin before its last texel's centre, and one."""
+        """Number of cells of a clamped map: all that begin before its last texel's centre, and one
+        more."""
         return ceil((self.texels - 1) / self.cell) + 1
 
     def cell_of(self, seed: mi.Int) -> tuple[mi.Int, mi.Float]:
-        """The cell of a seed, and the seed's place in it."""
+        """The cell of a seed, and the seed's position in the cell (cells)."""
         cell = floor_int((mi.Float(seed) + 0.5) * (1 / self.seeds))
         return cell, dr.fma(1 / self.seeds, mi.Float(seed - cell * self.seeds), self.offset)
 
     def texel(self, cell: mi.UInt32, place: mi.Float, wrap_mode: str) -> tuple[mi.Int, mi.Float]:
-        """The quad of texels, as stored, that holds a place in a stored cell, and where."""
+        """The stored quad of texels that holds the position ``place`` of a stored cell, and the
+        position in the quad (texels)."""
         clamped = wrap_mode == "clamp"
         position = (mi.Float(cell) - (BLOCK if clamped else 0) + place) * self.cell
         if clamped:  # the map is constant beyond its border
@@ -153,17 +164,17 @@ class SeedAxis:
 
 
 class Mixture(PNDF):
-    """A P-NDF of Gaussian elements on a lattice of cells; what all kinds of them share.
+    """A P-NDF of Gaussian elements on a lattice of cells: the base class of all kinds of elements.
 
     A subclass sets
 
     Attributes:
-        lattice (Lattice): the cells, with ``map_cells`` (columns, rows) of them to a map.
-        lists (QuadLists): the cells whose elements may show a normal; None where all footprints
-            are small.
-        variance (float): of S, cells².
+        lattice (Lattice): the cells; a map has ``map_cells`` (columns, rows) of them.
+        lists (QuadLists): for each bin of normals, the cells whose elements may contribute to it;
+            None where all footprints are small.
+        variance (float): variance σ_h² of an element's position (S = σ_h² I), cells².
         sigma_r (mi.Float): standard deviation σ_r of the normals of a flat element.
-        wrap_mode (str): what lies beyond the map.
+        wrap_mode (str): how the map continues beyond its border.
 
     and implements the methods that raise ``NotImplementedError`` here.
     """
@@ -178,35 +189,38 @@ class Mixture(PNDF):
 
     maskings = ("footprint", "beckmann", "none")
 
-    #: The slopes' moments, and whether masking asks for them.
+    #: Moments of the map's slopes, and whether the masking needs them.
     slopes: MomentPyramid | None = None
     masked = False
 
-    #: ρ² of the cut where the footprint is a point: its elements are interpolated there, and the
-    #: nearest ones are the best. The farthest point of a lattice has ρ² = 2.8.
+    #: ρ² of the cut where the footprint is a point. Elements are interpolated there, and the
+    #: nearest ones are the most accurate. No point of a lattice is farther than ρ² = 2.8 from the
+    #: nearest element.
     point_cut = 4.0
 
-    #: Merged elements, for spread normals; None where they have not been asked for.
+    #: Merged elements, for queries with a light's spread; None until :meth:`prepare_for_lights`.
     levels: Levels | None = None
 
-    #: Where the lattice of cells begins, in cells from where its first texel would have its centre.
+    #: Corner of the first cell, in cells; (−½, −½) is the corner of the map.
     origin: tuple[float, ...] = (0.0, 0.0)
 
     def lobes(self, kernel: TexelKernel, query: Query | None = None) -> Callable:
-        """What the footprint makes of elements, as a function ``(row, column, corner, active)``.
+        """The elements as the footprint sees them: a function ``(row, column, corner, active)``.
 
-        Normals spread, and the half vector turns, as ``query`` says; without one they do not.
+        The function yields the elements of a stored cell. ``corner`` is the cell's corner relative
+        to the footprint's centre (cells). Of each element it yields ``(area, ρ², normal, shift,
+        Gaussian)``: the element's area (cells), ρ² of its position, a projected normal, the offset
+        of the mean normal from it (None for zero), and the distribution of normals about the mean.
 
-        It lists the elements of a stored cell, whose ``corner`` is given from the footprint's
-        centre (cells): of each its area (cells), ρ² of its place, and of its normals a projected
-        normal, how far their mean is from there (None for not at all), and their
-        :class:`~.Gaussian`.
+        ``query`` gives the light's spread and the half vector's turn; without a query both are 0.
         """
         raise NotImplementedError
 
     def is_small(self, kernel: TexelKernel, steps: mi.Float) -> mi.Bool:
-        """Whether to sum all elements under the footprint, and with them W; ``steps`` is its minor
-        standard deviation in steps from one element to the next."""
+        """Whether D and W are sums over all elements under the footprint.
+
+        ``steps``: minor standard deviation of T, in steps from one element to the next.
+        """
         raise NotImplementedError
 
     def sum_all(self, kernel: TexelKernel, add: Callable, active, zero):
@@ -214,11 +228,11 @@ class Mixture(PNDF):
         raise NotImplementedError
 
     def mass(self, kernel: TexelKernel) -> mi.Float:
-        """W: mass of all elements under a large footprint, without a cut."""
+        """W: the mass of all elements under a large footprint, without a cut."""
         raise NotImplementedError
 
     def turn_per_cell(self, query: Query) -> mi.Matrix2f | None:
-        """H of a query in the units of positions."""
+        """The half vector's turn H, per cell; None where the query has none."""
         if query.turn is None:
             return None
         columns, rows = self.map_cells
@@ -227,22 +241,22 @@ class Mixture(PNDF):
     def draw_seed(self, position, random_x, random_y, active) -> tuple:
         """Draw an element in proportion to its Gaussian at ``position`` (cells).
 
-        Returns the indices of its seed, its place (cells), and the probability with which it is
-        to be accepted.
+        Returns the indices x and y of its seed, the seed's position (cells), and the probability
+        with which the caller must accept it.
         """
         raise NotImplementedError
 
     def element(self, x, y, active) -> tuple:
-        """Normal and Jacobian of the seed with these indices."""
+        """Projected normal, and Jacobian per cell (None for a flat element), of a seed."""
         raise NotImplementedError
 
     def weights(self, query: Query) -> tuple[TexelKernel, mi.Bool, mi.Float]:
-        """N(0, T), which weighs the elements, in cells; whether to sum all that it covers; and ρ²
-        of its cut."""
+        """``(kernel, small, cut)``: the Gaussian N(0, T) that weights the elements, in cells;
+        whether to sum over all that it covers; ρ² of its cut."""
         return query.once((self, "weights"), lambda: self.weigh(query.footprint))
 
     def weigh(self, footprint: Footprint) -> tuple[TexelKernel, mi.Bool, mi.Float]:
-        """What :meth:`weights` returns."""
+        """Compute what :meth:`weights` returns."""
         columns, rows = self.map_cells
         added = (self.variance, self.variance)
         kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
@@ -250,21 +264,21 @@ class Mixture(PNDF):
         steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
         cut = cut_of_sums(steps, self.point_cut)
         kernel.cut_at(dr.sqrt(cut))
-        few = self.is_small(kernel, steps)
-        cut = dr.select(few, cut, cut_of_lists(steps))
+        small = self.is_small(kernel, steps)
+        cut = dr.select(small, cut, cut_of_lists(steps))
         kernel.cut_at(dr.sqrt(cut))
-        return kernel, few, cut
+        return kernel, small, cut
 
     def projected_areas(self, directions, query, active):
-        """Those of the elements, each with its own; of large footprints by the slopes' moments."""
-        kernel, few, cut = self.weights(query)
+        """The projected areas of the elements; for large footprints, from the moments of slopes."""
+        kernel, small, cut = self.weights(query)
         lobes = self.lobes(kernel)
 
         def add(sums, *cell):
             mass, slope, *areas = sums
-            for area, near, normal, shift, normals in lobes(*cell):
-                weight = area * dr.clip((cut - near) * (1 / FADE), 0, 1) * dr.exp(-0.5 * near)
-                weight = dr.select(cell[-1], weight, 0)
+            for area, rho_squared, normal, shift, normals in lobes(*cell):
+                weight = area * dr.clip((cut - rho_squared) * (1 / FADE), 0, 1)
+                weight = dr.select(cell[-1], weight * dr.exp(-0.5 * rho_squared), 0)
                 mean = mi.Vector2f(normal if shift is None else normal + shift)
                 mass, slope = mass + weight, slope + weight * slope_of(mean)
                 areas = [
@@ -274,18 +288,19 @@ class Mixture(PNDF):
             return mass, slope, *areas
 
         zero = (mi.Float(0), mi.Vector2f(0), *(mi.Float(0) for _ in directions))
-        mass, slope, *areas = self.sum_all(kernel, add, active & few, zero)
+        mass, slope, *areas = self.sum_all(kernel, add, active & small, zero)
         inverse = dr.rcp(dr.select(mass > 0, mass, 1))
         summed = [area * inverse for area in areas], slope * inverse
         if self.slopes is None:
             return summed
-        return choose_areas(few, summed, self.areas_of_many(directions, query, active & ~few))
+        return choose_areas(small, summed, self.areas_of_many(directions, query, active & ~small))
 
     def areas_of_many(self, directions: list, query: Query, active: mi.Bool) -> tuple:
-        """``(areas, mean slope)`` of a large footprint, by averages of the slopes' moments."""
+        """``(areas, mean slope)`` of a large footprint, from averages of the slopes' moments."""
         slope, covariance = self.slope_moments(query, active)
-        turned = 1 + dr.squared_norm(slope)  # as the intrinsic roughness widens with the slope
-        rough = dr.square(self.sigma_r) * turned
+        # σ_r is a deviation of projected normals: as one of slopes, it grows with the mean slope.
+        stretch = 1 + dr.squared_norm(slope)
+        rough = dr.square(self.sigma_r) * stretch
         xx, xy, yy = covariance
         covariance = (
             dr.fma(rough, 1 + slope.x * slope.x, xx),
@@ -303,7 +318,7 @@ class Mixture(PNDF):
         raise NotImplementedError
 
     def make_slopes(self) -> MomentPyramid | None:
-        """What :meth:`slope_moments` looks up; None where no footprint is large."""
+        """The pyramid that :meth:`slope_moments` averages; None where no footprint is large."""
         raise NotImplementedError
 
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
@@ -313,56 +328,57 @@ class Mixture(PNDF):
         return super().masking(name, height_correlated)
 
     def overlap(self, kernel: TexelKernel) -> Overlap:
-        """What the footprint sees of every element."""
+        """The overlap of the footprint with an element, which is the same for all elements."""
         return Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=self.variance))
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 11); 0 outside of it."""
-        kernel, few, cut = self.weights(query)
+        kernel, small, cut = self.weights(query)
         lobes = self.lobes(kernel, query)
         active = active & (dr.squared_norm(m) < 1)
 
         def seen(*cell):
-            # Of each element its area, ρ², the peak of its normals' density, and the squared
-            # Mahalanobis distance of m from them.
-            for area, near, normal, shift, normals in lobes(*cell):
+            # Of each element its area, ρ², the largest density of its normals, and the squared
+            # Mahalanobis distance of m from their mean.
+            for area, rho_squared, normal, shift, normals in lobes(*cell):
                 delta = m - normal if shift is None else m - normal - shift
-                yield area, near, normals.peak, normals.distance_squared(delta)
+                yield area, rho_squared, normals.peak, normals.distance_squared(delta)
 
-        def share(area, near):
-            return area * dr.clip((cut - near) * (1 / FADE), 0, 1)
+        def share(area, rho_squared):
+            return area * dr.clip((cut - rho_squared) * (1 / FADE), 0, 1)
 
         def add(density, *cell):
             total = mi.Float(0)
-            for area, near, peak, alike in seen(*cell):
-                weight = share(area, near) * peak
-                total = dr.fma(weight, dr.exp(-0.5 * (near + alike)), total)
+            for area, rho_squared, peak, distance_squared in seen(*cell):
+                weight = share(area, rho_squared) * peak
+                total = dr.fma(weight, dr.exp(-0.5 * (rho_squared + distance_squared)), total)
             return density + dr.select(cell[-1], total, 0)
 
         def add_both(sums, *cell):
             total = mi.Vector2f(0)
-            for area, near, peak, alike in seen(*cell):
-                weight = share(area, near) * dr.exp(-0.5 * near)
-                total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * alike), weight)
+            for area, rho_squared, peak, distance_squared in seen(*cell):
+                weight = share(area, rho_squared) * dr.exp(-0.5 * rho_squared)
+                total = total + mi.Vector2f(weight * peak * dr.exp(-0.5 * distance_squared), weight)
             return sums + dr.select(cell[-1], total, 0)
 
-        density, mass = self.sum_all(kernel, add_both, active & few, mi.Vector2f(0))
-        coarse = self.asked_coarsely(query, few)
+        density, mass = self.sum_all(kernel, add_both, active & small, mi.Vector2f(0))
+        merged = self.uses_merged(query, small)
         if self.lists is not None:
-            listed = active & ~few & ~coarse & self.lists.covers(m)
+            listed = active & ~small & ~merged & self.lists.covers(m)
             density = density + self.lists.visit(m, kernel, add, listed)
         gaussian = 2 * pi * kernel.sigma_u_given_v * kernel.sigma_v
         gaussian = gaussian * mass_under_fade(cut)
-        mass = dr.select(few, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
+        mass = dr.select(small, dr.select(mass > 0, mass, 1), gaussian * self.mass(kernel))
         density = density / mass
         if self.levels is not None and (query.spread or query.turn is not None):
-            of_levels = self.levels.eval(m, query, dr.square(self.sigma_r), active & coarse)
-            density = dr.select(coarse, of_levels, density)
+            of_merged = self.levels.eval(m, query, dr.square(self.sigma_r), active & merged)
+            density = dr.select(merged, of_merged, density)
         return density
 
-    def asked_coarsely(self, query: Query, few: mi.Bool) -> mi.Bool:
-        """Where the coarse elements are to answer, as normals spread, or the half vector turns,
-        further than the lists of elements reach; but not where all of ``few`` are summed."""
+    def uses_merged(self, query: Query, small: mi.Bool) -> mi.Bool:
+        """Whether merged elements answer the query: the light's spread and the half vector's turn
+        reach beyond the lists of elements. Never where the footprint is ``small``, as all elements
+        are summed there."""
         if self.levels is None:
             return mi.Bool(False)
         variance = mi.Float(0)
@@ -372,20 +388,21 @@ class Mixture(PNDF):
             footprint = query.footprint
             for axis in (footprint.du, footprint.dv):
                 variance = variance + dr.squared_norm(query.turn @ axis)
-        # Of both directions together
+        # ``variance`` and ``slope`` are of both components together, ``own`` is of one.
         curved = 0.5 * self.levels.slope**2 * self.variance / SIGMA_H**2
         own = dr.square(self.sigma_r) + dr.opaque(mi.Float, curved)
-        return ~few & (variance > 2 * LISTS_SPREAD * own)
+        return ~small & (variance > 2 * LISTS_SPREAD * own)
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D.
 
-        An element is drawn in proportion to its mass N(d; 0, T) under the footprint: a point u of
-        the footprint, then an element seen there, accepted such that the mass seen there, which
-        differs from point to point, does not count. Then a normal of this element. The random
-        numbers of all but the first point are a hash of the samples.
+        First an element is drawn in proportion to its mass N(d; 0, T) under the footprint: a point
+        u of the footprint, then an element in proportion to its Gaussian at u. The sum of these
+        Gaussians differs from point to point; the element is accepted in proportion to this sum,
+        which corrects for it. Then a normal of this element is drawn. The first point is made of
+        the samples; all other random numbers are a hash of them.
         """
         kernel, _, cut = self.weights(query)
         bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
@@ -417,7 +434,7 @@ class Mixture(PNDF):
         turn = self.turn_per_cell(query)
         if jacobian is not None or turn is not None:
             overlap = self.overlap(kernel)
-            moved = less(jacobian, turn)
+            moved = relative_jacobian(jacobian, turn)
             mean = normal - moved @ overlap.mean(offset)
             if turn is not None:
                 mean = mean - turn @ offset
@@ -452,7 +469,7 @@ def draw_neighbour(x, random):
     Returns k, and the sum of these densities over all k.
     """
     first = dr.floor(x) - 2
-    # Six integers: what lies beyond weighs less than 1e-10.
+    # Six integers are enough: all others together weigh less than 1e-10.
     weights = [dr.exp((-0.5 / SIGMA_H**2) * dr.square(x - first - k)) for k in range(6)]
     total = sum(weights)
     left, k = random * total, mi.Float(0)
@@ -462,35 +479,37 @@ def draw_neighbour(x, random):
     return mi.Int(first + k), total * (1 / (SIGMA_H * sqrt(2 * pi)))
 
 
-#: The largest sum of :func:`draw_neighbour`, that at an integer.
-DENSEST = sum(exp(-0.5 * (k / SIGMA_H) ** 2) for k in range(-3, 4)) / (SIGMA_H * sqrt(2 * pi))
+#: The largest sum that :func:`draw_neighbour` returns: it occurs at integers.
+LARGEST_SUM = sum(exp(-0.5 * (k / SIGMA_H) ** 2) for k in range(-3, 4)) / (SIGMA_H * sqrt(2 * pi))
 
 
 @register("elements", title="elements", plugin="glint_elements")
 class Elements(Mixture):
-    """Elements of a normal map, and their exact sampler.
+    """The P-NDF of the elements of a normal map.
 
-    Nothing is stored per element: its normal and Jacobian come from the four texels around it.
-    Belongs to the variant of Mitsuba that is active when it is made.
+    Nothing is stored per element: its normal and Jacobian come from the four texels around it. The
+    object belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
         normal_map (NormalMap): the map; between texel centres, normals are those of the triangle
             mesh of :mod:`~glintbsdf.reference`.
-        sigma_r (float): intrinsic roughness σ_r, the standard deviation of a projected normal.
-        step (float): h, texels from one seed to the next. It is rounded so that a whole number of
-            steps makes the map.
+        sigma_r (float): intrinsic roughness σ_r, the standard deviation of a projected normal, in
+            [1e-8, 1].
+        step (float): h, texels from one seed to the next, > 0. It is rounded so that a whole number
+            of steps makes the map.
         curved (bool): whether elements follow the map's Jacobian (Eq. 13) or are flat (Eq. 12).
         owner (str): the name that errors give, usually the plugin's.
-        domain (Domain): what will be asked; None for anything. Where all footprints are summed cell
-            by cell, no lists are made; within the domain D is the same to the last bit.
-        data (mi.TensorXf): the normals of ``normal_map`` where they carry derivatives.
+        domain (Domain): the queries to expect; None for any. Where all footprints are small, no
+            lists are built. Within the domain D is the same to the last bit.
+        data (mi.TensorXf): the normals of ``normal_map``, as an array that carries derivatives.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it and through
             ``sigma_r``; after a change of values, :meth:`parameters_changed` rebuilds what depends
             on them.
 
-    Raises :class:`~.ParameterError`.
+    Raises:
+        ParameterError: ``sigma_r`` or ``step`` is out of range.
     """
 
     normal_map: NormalMap
@@ -513,12 +532,12 @@ class Elements(Mixture):
         self.data = mi.TensorXf(normal_map.normals) if data is None else data
         self.changed = data is not None
         self.sigma_r = mi.Float(sigma_r)
-        if self.changed:  # another map must not need another kernel
+        if self.changed:  # otherwise another map would need another kernel
             dr.make_opaque(self.sigma_r)
         self.build(domain)
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make everything that depends on ``data`` and ``sigma_r``."""
+        """Build everything that depends on ``data`` and ``sigma_r``, for queries in ``domain``."""
         self.domain = domain
         height, width, _ = self.data.shape
         self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
@@ -539,7 +558,8 @@ class Elements(Mixture):
             rows, columns = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
             self.lattice = Lattice(rows, columns, self.wrap_mode)
 
-        # By the side of the diagonal, so that elements with the same Jacobian are neighbours.
+        # Sorted by the side of the diagonal: elements with the same Jacobian are neighbours, and
+        # :meth:`lobes` makes their distribution once.
         self.places = sorted(
             ((u, v) for v in y.places for u in x.places),
             key=lambda place: side_of_diagonal(*place),
@@ -571,7 +591,7 @@ class Elements(Mixture):
         return mi.Vector2f(x, y), (xx, xy, yy)
 
     def areas_of_many(self, directions, query, active):
-        """Where the chain of moments is too coarse, by points of the map."""
+        """As the base class; by points of the map where the pyramid of moments is too coarse."""
         height, width, _ = self.data.shape
         kernel = query.texel_kernel("gaussian", height, width, self.wrap_mode)
         narrow = kernel.minor_variance < level_sigma(FIRST_LEVEL) ** 2
@@ -582,7 +602,7 @@ class Elements(Mixture):
         return choose_areas(narrow, points, averages)
 
     def frame_at(self, u: mi.Point2f, active: mi.Bool) -> tuple:
-        """The map's projected normal at a place (texels), and its derivatives, as
+        """The map's projected normal at a position (texels), and its derivatives; as
         :meth:`.TexelMesh.frame_at`."""
         column, row = floor_int(u.x), floor_int(u.y)
         rows, columns = self.texels.y, self.texels.x
@@ -594,8 +614,8 @@ class Elements(Mixture):
             self.levels = Levels(self.data, self.wrap_mode)
 
     def all_small(self, sigma: float) -> bool:
-        """Whether footprints of standard deviations up to ``sigma`` (texels) are summed cell by
-        cell: the round one of this size covers most cells."""
+        """Whether all footprints are small whose standard deviations are at most ``sigma``
+        (texels): the round one of this size covers the most cells."""
         height, width, _ = self.data.shape
         largest = Footprint(
             mi.Point2f(0), mi.Vector2f(sigma / width, 0), mi.Vector2f(0, sigma / height)
@@ -607,13 +627,13 @@ class Elements(Mixture):
     # --------------------------------------------------------------------------------------------
 
     def corner_normals(self, row, column, active):
-        """Projected normals n0…n3 around a stored quad of texels."""
+        """Projected normals n0…n3 at the corners of a stored quad of texels."""
         return self.texels.corner_values(self.vertices, row, column, active)
 
     def located(self, row, column, x, y):
-        """The quad of texels that holds the place (``x``, ``y``) of a stored cell, and where.
+        """The quad of texels that holds the position (``x``, ``y``) of a stored cell.
 
-        Returns row and column as stored, and the place in the quad.
+        Returns the row and the column of the stored quad, and the position x, y in the quad.
         """
         if self.aligned:
             return row, column, x, y
@@ -622,19 +642,20 @@ class Elements(Mixture):
         return row, column, x, y
 
     def jacobian(self, normals, side):
-        """The mesh's Jacobian, per cell, on this side of a quad's diagonal; None if flat."""
+        """The Jacobian J = ∂n/∂u of the mesh, per cell, on one side of a quad's diagonal; None if
+        elements are flat."""
         if not self.curved:
             return None
         n0, n1, n2, n3 = normals
-        along_x = mixed(n1 - n0, n3 - n2, side) * self.axes[0].cell
-        along_y = mixed(n2 - n0, n3 - n1, side) * self.axes[1].cell
+        along_x = interpolate(n1 - n0, n3 - n2, side) * self.axes[0].cell
+        along_y = interpolate(n2 - n0, n3 - n1, side) * self.axes[1].cell
         return mi.Matrix2f(along_x.x, along_y.x, along_x.y, along_y.y)
 
     def elements(self, row, column, active):
         """The elements of a stored cell, in the order of ``places``.
 
-        Of each, the mesh's normal at the element's anchor, a place in the cell, and its Jacobian
-        (``mi.Matrix2f``, per cell), None for a flat one.
+        Of each element: the mesh's projected normal at its anchor, which is a position in the
+        cell, and its Jacobian (``mi.Matrix2f``, per cell), None for a flat one.
         """
         row, column, *inside = self.located(row, column, *self.places[0])
         normals = self.corner_normals(row, column, active)
@@ -652,7 +673,7 @@ class Elements(Mixture):
         turn = self.turn_per_cell(query) if query else None
         overlap = self.overlap(kernel)
         area = 1 / len(self.places)
-        # What does not depend on the cell.
+        # These do not depend on the cell.
         whitened = [kernel.whitened(mi.Vector2f(*place)) for place in self.places]
         steps = [
             overlap.gain @ mi.Vector2f(*place) - mi.Vector2f(*place) + mi.Vector2f(*anchor)
@@ -665,10 +686,11 @@ class Elements(Mixture):
             for k, (normal, jacobian) in enumerate(self.elements(row, column, active)):
                 shift = None
                 if jacobian is not None:
-                    # s_i + J μ: the normal is that of the anchor, and μ = −S T⁻¹ offset.
+                    # The mean is s_i + J μ, with μ = −S T⁻¹ offset; J also leads from the anchor,
+                    # where ``normal`` is taken, to the seed.
                     shift = -(jacobian @ (step + steps[k]))
                 if turn is not None:
-                    # The half vector where the footprint sees the element, offset + μ away.
+                    # The half vector at offset + μ, where the footprint sees the element.
                     place = mi.Vector2f(*self.places[k])
                     turned = turn @ (corner + place - step - overlap.gain @ place)
                     shift = -turned if shift is None else shift - turned
@@ -676,9 +698,9 @@ class Elements(Mixture):
                     jacobian is not of or distribution is roughness
                 ):
                     of = jacobian
-                    distribution = overlap.normals(less(jacobian, turn), roughness)
-                near = dr.squared_norm(white_corner + whitened[k])
-                yield area, near, normal, shift, distribution
+                    distribution = overlap.normals(relative_jacobian(jacobian, turn), roughness)
+                rho_squared = dr.squared_norm(white_corner + whitened[k])
+                yield area, rho_squared, normal, shift, distribution
 
         return lobes
 
@@ -703,7 +725,7 @@ class Elements(Mixture):
         x, mass_x = draw_neighbour((position.x - offset.x) * self.seeds, random_x)
         y, mass_y = draw_neighbour((position.y - offset.y) * self.seeds, random_y)
         place = mi.Vector2f(x, y) * (1 / self.seeds) + offset
-        return x, y, place, mass_x * mass_y * (1 / DENSEST**2)
+        return x, y, place, mass_x * mass_y * (1 / LARGEST_SUM**2)
 
     def mass(self, kernel):
         x = (kernel.mean - mi.Vector2f(*(axis.offset for axis in self.axes))) * self.seeds
@@ -721,7 +743,8 @@ class Elements(Mixture):
     # --------------------------------------------------------------------------------------------
 
     def ellipses(self, row, column, active=True):
-        """The ellipses of projected normals in which the elements of a stored cell lie."""
+        """Ellipses of projected normals, one for each element of a stored cell, that hold its
+        normals."""
         with dr.suspend_grad():
             return tuple(
                 self.ellipse(normal, mi.Vector2f(place) - mi.Vector2f(anchor), jacobian)
@@ -731,7 +754,8 @@ class Elements(Mixture):
             )
 
     def ellipse(self, normal, step, jacobian):
-        """That of an element, ``step`` from its anchor: all of its normals, cut."""
+        """The ellipse of an element: centre and two conjugate radii. It bounds all normals within
+        ``NORMAL_REACH``. ``step`` leads from the element's anchor to its seed (cells)."""
         spread = ()
         if jacobian is not None:
             normal = normal + jacobian @ step
@@ -741,7 +765,7 @@ class Elements(Mixture):
         return normal, *(NORMAL_REACH * radius for radius in radii)
 
     def build_lists(self) -> dict[str, np.ndarray]:
-        """The lists of cells by normal."""
+        """The lists of cells, by normal."""
         blocks = BlocksOfEllipses(self.lattice, self.ellipses, len(self.places))
         normals = self.data.numpy().reshape(-1, 2)
         return Builder(
@@ -751,7 +775,8 @@ class Elements(Mixture):
     def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The rectangle (lower, upper) that holds the ellipses of all cells, and a margin.
 
-        In the margin the cells at its border are found: of a flat map, all that is beyond reach.
+        The margin keeps the normals at the border of the ellipses inside of the grid of lists,
+        even where the map is flat.
         """
         index = dr.arange(mi.UInt32, self.lattice.x.quads * self.lattice.y.quads)
         columns = mi.UInt32(self.lattice.x.count)
@@ -773,7 +798,7 @@ class Elements(Mixture):
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check new values, and rebuild. Derivatives keep flowing to them."""
+        """Check new values, and rebuild. Derivatives keep flowing to the parameters."""
         if keys and not {"data", "sigma_r"} & set(keys):
             return
         check_sigma_r(self.owner, self.sigma_r[0])
@@ -793,35 +818,36 @@ class Elements(Mixture):
         )
 
 
-#: By the side of a quad's diagonal: a corner at which the mesh has the normal that a Jacobian there
-#: begins from, as a place and as an index.
+#: For each side of a quad's diagonal: the corner at which its elements are anchored, as a position
+#: and as an index. From its normal, the side's Jacobian leads to all others.
 ANCHORS = {0.0: ((0, 0), 0), 0.5: ((1, 0), 1), 1.0: ((1, 1), 3)}
 
 
-def less(jacobian: mi.Matrix2f | None, turn: mi.Matrix2f | None) -> mi.Matrix2f:
-    """J − H."""
+def relative_jacobian(jacobian: mi.Matrix2f | None, turn: mi.Matrix2f | None) -> mi.Matrix2f:
+    """J − H: the map's Jacobian relative to the half vector's turn (None for zero, both)."""
     if turn is None:
         return jacobian
     return -turn if jacobian is None else jacobian - turn
 
 
 def side_of_diagonal(x, y):
-    """0 for the place (``x``, ``y``) in the first triangle of a quad, 1 in the second, or ½."""
+    """0 where (``x``, ``y``) is in the first triangle of a quad, 1 in the second, ½ on the
+    diagonal."""
     beyond = x + y - 1
     return dr.select(dr.abs(beyond) < 1e-5, 0.5, dr.select(beyond > 0, 1.0, 0.0))
 
 
-def mixed(first, second, share):
-    """(1 − ``share``) ``first`` + ``share`` ``second``."""
+def interpolate(first, second, share):
+    """Linear interpolation: (1 − ``share``) ``first`` + ``share`` ``second``."""
     if isinstance(share, float) and share in (0, 1):
         return second if share else first
     return first + (second - first) * share
 
 
 def normal_at(normals, x, y):
-    """The mesh's normal at the place (``x``, ``y``) of a quad with these corner normals.
+    """The mesh's normal at (``x``, ``y``) in a quad with these corner normals.
 
-    The triangles (n0, n1, n2) and (n3, n2, n1) differ by a kink along their diagonal.
+    The planes of the triangles (n0, n1, n2) and (n3, n2, n1) meet in a kink along the diagonal.
     """
     n0, n1, n2, n3 = normals
     kink = n3 - n2 - (n1 - n0)
@@ -829,6 +855,6 @@ def normal_at(normals, x, y):
 
 
 def check_sigma_r(owner: str, sigma_r: float) -> None:
-    """Raise :class:`~.ParameterError` for a roughness that is not allowed."""
+    """Raise :class:`~.ParameterError` unless the roughness is within its bounds."""
     requirement = f"a number in [{MIN_SIGMA_R:g}, {MAX_SIGMA_R:g}]"
     check(MIN_SIGMA_R <= sigma_r <= MAX_SIGMA_R, owner, "sigma_r", requirement, sigma_r)

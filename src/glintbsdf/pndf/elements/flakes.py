@@ -23,19 +23,21 @@ from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import SHIFT, Builder, QuadLists
 
-#: Finest level of the chain of the slopes' moments: its Gaussian is as wide as those footprints.
+#: Finest level of the pyramid of slope moments: its Gaussian is as wide as the narrowest footprint
+#: that is not summed flake by flake.
 FIRST_LEVEL = 8
 
 #: Footprints whose minor standard deviation is below this, in mean distances of flakes, are summed
-#: flake by flake; from there on, flakes with balanced areas cover the surface evenly, within 1e-3.
-EVEN = 2.6
+#: flake by flake. Under wider footprints, flakes with balanced areas cover the surface evenly,
+#: within 1e-3, so that their mass W is 1.
+MIN_SIGMA_OF_LISTS = 2.6
 
-#: Memory that building takes, bytes per flake (measured), and that the lists are allowed.
+#: Memory that building takes, and memory that the lists may take, in bytes per flake.
 BYTES_TO_BUILD, BYTES_OF_LISTS = 600, 42
 
 
 class BlocksOfFlakes(BlocksOfEllipses):
-    """The cells that have a flake."""
+    """The cells that hold a flake, as blocks for the builder of the lists."""
 
     def __init__(self, lattice: Lattice, ellipses, occupied, count: int) -> None:
         super().__init__(lattice, ellipses, shapes_each=1)
@@ -51,7 +53,7 @@ class BlocksOfFlakes(BlocksOfEllipses):
 
 @dataclass
 class Surroundings:
-    """A square around a position, in the role of a kernel: ``reach_v`` (cells) to each side."""
+    """A square around ``mean`` (cells) in place of a kernel; ``reach_v`` is half its side."""
 
     mean: mi.Point2f
     reach_v: float
@@ -69,32 +71,33 @@ class Surroundings:
     settings={"flake_density": 4000.0},
 )
 class Flakes(Mixture):
-    """Flat elements scattered over the unit UV square, which repeats, and their exact sampler.
+    """The P-NDF of flat elements scattered over the unit UV square, which repeats.
 
-    Seeds are a Poisson-disk pattern; each flake has one normal, drawn from a Beckmann distribution.
-    The flakes share the whole surface: the smaller the footprint, the more it is that of the
-    nearest. Belongs to the variant of Mitsuba that is active when it is made.
+    Seeds are a Poisson-disk pattern. Each flake has one normal, drawn from a Beckmann distribution.
+    The flakes cover the whole surface: a small footprint sees the flake that is nearest to it. The
+    object belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
         density (float): flakes per unit of UV area, rounded to a whole number ≥ 1.
-        alpha (float): Beckmann roughness of the flakes' normals, ≥ 0.
-        sigma_r (float): intrinsic roughness σ_r of each.
-        seed (int): of the pattern and the normals.
+        alpha (float): Beckmann roughness α of the flakes' normals, ≥ 0.
+        sigma_r (float): intrinsic roughness σ_r of each flake, in [1e-8, 1].
+        seed (int): seed of the pattern and of the normals, ≥ 0.
         owner (str): the name that errors give, usually the plugin's.
 
     Attributes:
-        flake_alpha (mi.Float): α. Its derivatives are those of flakes whose slopes grow with it:
-            each stays where it is, and turns.
+        flake_alpha (mi.Float): α. Derivatives with respect to it leave every flake in its place,
+            and scale its slope.
 
-    Raises :class:`~.ParameterError`; for more flakes than memory holds before any
-    is allocated.
+    Raises:
+        ParameterError: a parameter is out of range, or there are more flakes than half of the
+            machine's memory can build; this is checked before anything is allocated.
     """
 
     roughness_keys = ("flake_alpha", "sigma_r")
 
     wrap_mode = "repeat"
-    origin = (-0.5, -0.5)  # cells begin at the border of the square
-    point_cut = 16.0  # reaches 1.7 mean distances, across any gap
+    origin = (-0.5, -0.5)  # the first cell begins at the corner of the square
+    point_cut = 16.0  # 1.7 mean distances of flakes: no gap between flakes is as wide
 
     def __init__(
         self,
@@ -126,8 +129,8 @@ class Flakes(Mixture):
         self.build()
 
     def scatter(self) -> dict[str, np.ndarray]:
-        """Places, areas and normal deviates of the flakes, n×n, by cells, and the largest mass
-        seen; slopes are the deviates times α/√2."""
+        """Positions, areas and normal deviates of the flakes, by cell (n×n), and a bound on the sum
+        of their Gaussians. A flake's slope is its two deviates times α/√2."""
         rng = np.random.default_rng(self.seed)
         places = poisson_disk(self.count, rng)
         areas = balanced_areas(places)
@@ -156,12 +159,12 @@ class Flakes(Mixture):
         return mi.Vector2f(dr.square(self.flake_alpha))
 
     def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        # In the margin the cells at its border are found.
+        # The margin keeps the normals at the border inside of the grid of lists.
         outer = (NORMAL_REACH + 1.5) * self.sigma_r[0]
         return self.flake_normals.min(0) - outer, self.flake_normals.max(0) + outer
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make everything that depends on ``sigma_r``, for any query."""
+        """Build everything that depends on ``sigma_r``, for any query."""
         reach = NORMAL_REACH * self.sigma_r[0]
 
         def ellipses(row, column, active):
@@ -178,7 +181,7 @@ class Flakes(Mixture):
 
         key = self.count, self.flake_alpha[0], self.seed, self.sigma_r[0]
         self.lists = QuadLists(self.lattice, self.cached(build_lists, *key))
-        # With a single cell of normals: all flakes, block by block.
+        # With no memory for lists by normal, there is one list of all flakes, block by block.
         self.all = QuadLists(self.lattice, build_lists(0))
         self.slopes = self.make_slopes() if self.masked else None
 
@@ -186,7 +189,7 @@ class Flakes(Mixture):
         return mi.UInt32(row * self.map_cells[0] + column)
 
     def flake(self, row, column, active):
-        """Place in its cell, and normal, of the flake of a cell."""
+        """Position in its cell (cells), and projected normal, of the flake of a cell."""
         x, y, normal_x, normal_y = dr.gather(
             mi.Vector4f, self.flakes, self.index(row, column), active
         )
@@ -198,13 +201,14 @@ class Flakes(Mixture):
         def lobes(row, column, corner, active):
             place, normal = self.flake(row, column, active)
             area = dr.gather(mi.Float, self.areas, self.index(row, column), active)
-            near = dr.squared_norm(kernel.whitened(corner + place))
-            yield area, near, normal, None, roughness
+            rho_squared = dr.squared_norm(kernel.whitened(corner + place))
+            yield area, rho_squared, normal, None, roughness
 
         return lobes
 
     def make_slopes(self) -> MomentPyramid:
-        """Sums of the flakes' slopes and their products, by cells; a mean cell has the area 1."""
+        """The flakes' slopes and their products, weighted by area and summed in each cell; a cell
+        of mean area has weight 1."""
         n = self.map_cells[0]
         index = dr.arange(mi.UInt32, n * n)
         normal = self.flake(index // n, index % n, True)[1]
@@ -219,7 +223,7 @@ class Flakes(Mixture):
         return mi.Vector2f(x, y), (xx - x * x, xy - x * y, yy - y * y)
 
     def is_small(self, kernel, steps):
-        return steps < EVEN
+        return steps < MIN_SIGMA_OF_LISTS
 
     def sum_all(self, kernel, add, active, zero):
         return self.all.visit(mi.Vector2f(0), kernel, add, active, zero)
@@ -236,7 +240,7 @@ class Flakes(Mixture):
             weight = dr.select(active, weight, 0)
             total = total + weight
             share = weight / dr.maximum(total, 1e-30)
-            # A reservoir of one: what is left of the random number decides on the next.
+            # Reservoir sampling with one random number: it is rescaled after each decision.
             taken = left < share
             left = dr.select(taken, left / share, (left - share) / (1 - share))
             return (
@@ -280,15 +284,16 @@ class Flakes(Mixture):
 
 
 def check_alpha(owner: str, alpha: float) -> None:
-    """Raise :class:`~.ParameterError` for a roughness of flakes that is not allowed."""
+    """Raise :class:`~.ParameterError` unless the roughness of flakes is finite and ≥ 0."""
     check(0 <= alpha < inf, owner, "flake_alpha", "a finite number ≥ 0", alpha)
 
 
 def densest(places: np.ndarray, areas: np.ndarray) -> float:
-    """A bound on the sum of the flakes' Gaussians anywhere, from values on a grid of half cells.
+    """A bound on the sum of the flakes' Gaussians, anywhere, from its values on a grid.
 
-    The sum is smooth over σ_h, which is 0.8 cells: between the grid's points, at most 0.36 cells
-    from the nearest, it exceeds its largest value by less than a tenth.
+    The grid has two points per cell. The sum is smooth at the scale of σ_h, which is 0.8 cells. No
+    point of the surface is farther than 0.36 cells from the grid, so the sum exceeds its largest
+    value on the grid by less than a tenth.
     """
     n = len(places)
     row, column = np.nonzero(areas)
@@ -296,7 +301,7 @@ def densest(places: np.ndarray, areas: np.ndarray) -> float:
     steps = np.arange(-ceil(4 * sigma), ceil(4 * sigma) + 1)
 
     def spread(cells, offsets):
-        """The grid's points along an axis that a flake reaches, and its Gaussian there."""
+        """The grid points along an axis that a flake reaches, and its Gaussian there."""
         position = 2 * (cells + offsets)[:, None]
         points = np.floor(position).astype(np.int64) + steps
         weights = np.exp((-0.5 / sigma**2) * np.square(points + 0.5 - position))
@@ -308,13 +313,13 @@ def densest(places: np.ndarray, areas: np.ndarray) -> float:
     total = np.zeros((2 * n, 2 * n), np.float32)
     for y, weight_y in zip(rows, weights_y, strict=True):
         for x, weight_x in zip(columns, weights_x, strict=True):
-            # No two flakes are in one half cell: none is added to the same point.
+            # No two flakes are in the same half cell, so no point occurs twice in this sum.
             total[y, x] += area * weight_y * weight_x
     return 1.1 * float(total.max()) * 4 / (2 * pi * sigma**2)
 
 
 def check_memory(owner: str, count: int) -> None:
-    """Refuse more flakes than half of the machine's memory can build."""
+    """Raise :class:`~.ParameterError` for more flakes than half of the memory can build."""
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     needed = count * BYTES_TO_BUILD
     if needed > available:

@@ -1,16 +1,17 @@
-"""Coarse elements: a map's Gaussian elements, merged level by level, for spread normals.
+"""Merged elements: a pyramid of a map's Gaussian elements, for queries with a light's spread.
 
-Where a light has extent, what is asked is the P-NDF averaged over a spread of normals. A wide
-spread meets nearly every element under a footprint, and needs none of them in detail. So elements
-are merged: one of level ℓ stands for a Gaussian of the map's plane about 2^ℓ texels wide, and holds
-the mean of the normals there, their regression on position and the covariance that this leaves.
-All moments up to the second are those of the merged elements, so the mean and the covariance under
-every footprint are kept.
+Under a light of some extent, the P-NDF is averaged over a spread of normals. A wide spread covers
+nearly every element under a footprint and needs none of them in detail. So elements are merged,
+level by level. An element of level ℓ is a Gaussian of the map's plane, about 2^ℓ texels wide. It
+holds the mean of the normals there, their linear regression on position, and the covariance of the
+residual. Merging keeps all moments up to the second. So the mean and the covariance of the normals
+under every footprint are kept.
 
-The two-scale relation of Gaussians does it: one of variance S' is a sum of those of variance S that
-stand on a lattice, weighed by a Gaussian of variance S' − S. The elements of the level below, mean
-s, regression J, residual covariance Q, become a mixture whose raw moments about their common place
-are sums: of s, of J S + s dᵀ, and of Q + J S Jᵀ + s sᵀ, d the way from the merged place to theirs.
+Gaussians have a two-scale relation: a Gaussian of variance S' is a sum of Gaussians of variance S
+on a lattice, weighted by a Gaussian of variance S' − S. An element of the level below has mean s,
+regression J, residual covariance Q, and lies at d from the merged element. The raw moments of the
+merged element about its own position are then weighted sums of s, of J S + s dᵀ, and of
+Q + J S Jᵀ + s sᵀ.
 """
 
 from __future__ import annotations
@@ -28,41 +29,44 @@ from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap
 
-#: Squared Mahalanobis distance from the footprint's centre at which elements are cut, and the width
-#: over which they fade until there.
+#: Elements are cut where the squared Mahalanobis distance from the footprint's centre is CUT. Their
+#: weight falls linearly to 0 over the width FADE, up to the cut.
 CUT, FADE = 10.0, 2.0
 
-#: Cells that a footprint's minor standard deviation spans, about, at the level it is asked at.
-CELLS = 2.0
+#: The level of a query is the one at which a footprint's minor standard deviation spans about this
+#: many cells,
+CELLS_PER_SIGMA = 2.0
 
-#: Standard deviation of a cell's normals over that of the spread, about, at the level asked.
-DETAIL = 1.0
+#: or, if that is coarser, the standard deviation of a cell's normals is about this multiple of the
+#: light's spread.
+NORMALS_PER_SPREAD = 1.0
 
-#: Taps of the merging Gaussian on each side of its centre, in its standard deviations.
-TAPS = 4.0
+#: Reach of the Gaussian that merges elements, on each side of its centre, in standard deviations.
+MERGE_REACH = 4.0
 
-#: Standard deviations beyond the map's normals where nothing is left.
-REACH = 4.5
+#: D counts as 0 beyond this many standard deviations from the bounds of the map's normals.
+MARGIN = 4.5
 
-#: Variance of normals added to what merged elements leave, well above its rounding errors.
+#: Variance added to the residual covariance of merged elements, well above its rounding errors.
 ROUNDING = 1e-7
 
-#: Components of a symmetric matrix.
+#: Indices of the components of a symmetric 2×2 matrix.
 PAIRS = (0, 0), (0, 1), (1, 1)
 
-#: Floats of an element: mean 2, Jacobian 4, root of the residual covariance 3.
+#: Floats per element: 2 of the mean, 4 of the Jacobian, 3 of a root of the residual covariance.
 NUMBERS = 9
 
 
 @dataclass
-class Raw:
-    """Raw moments of the elements of a level, about their own places (arrays of rows × columns).
+class RawMoments:
+    """Raw moments of the elements of a level, about their own positions (arrays of rows × columns).
 
     Attributes:
-        n (list of 2): means.
-        nx, ny (lists of 2): of normal times offset along x and y, texels.
-        nn (list of 3): of products, xx, xy, yy.
-        counts, spacing (pairs, x first): elements along each axis, and texels between them.
+        n (list of 2): means of the projected normals.
+        nx, ny (lists of 2): means of normal times offset along x and y (texels).
+        nn (list of 3): means of the products xx, xy, yy of the normals.
+        counts (pair, x first): elements along each axis.
+        spacing (pair, x first): texels from one element to the next.
     """
 
     n: list
@@ -74,11 +78,11 @@ class Raw:
 
 
 class Levels:
-    """The coarse elements of a map, from one per texel upwards; :data:`NUMBERS` floats for each.
+    """The pyramid of merged elements of a map, from one element per texel up to a single one.
 
     Args:
         data (mi.TensorXf): projected normals, H×W×2; derivatives flow through it.
-        wrap_mode (str): what lies beyond the map.
+        wrap_mode (str): how the map continues beyond its border.
 
     Attributes:
         slope (float): standard deviation of the normals within a texel's Gaussian, over the map.
@@ -89,7 +93,7 @@ class Levels:
     def __init__(self, data: mi.TensorXf, wrap_mode: str) -> None:
         height, width, _ = data.shape
         self.wrap_mode = wrap_mode
-        base = texels(data, wrap_mode)
+        base = finest_level(data, wrap_mode)
         variance = sum(dr.mean(x * x + y * y) for x, y in (base.nx, base.ny))
         self.slope = max(float(np.sqrt(variance[0])) / SIGMA_H, 1e-12)
         x, y = base.n
@@ -104,7 +108,7 @@ class Levels:
             if tables:
                 raw = merged(merged(raw, 0, wrap_mode), 1, wrap_mode)
             offsets.append(sum(len(t) for t in tables) // NUMBERS)
-            tables.append(central(raw))
+            tables.append(elements_of(raw))
             sizes.append(raw.counts)
         self.count = len(tables)
         self.table = dr.concat(tables) if self.count > 1 else tables[0]
@@ -117,10 +121,14 @@ class Levels:
         self.nbytes = 4 * dr.width(self.table)
 
     def level_for(self, kernel: TexelKernel, spread: mi.Float) -> mi.UInt32:
-        """The level to ask, as an index, for a footprint (in texels) and a spread of normals, its
-        standard deviation: cells about as wide as either allows."""
-        by_footprint = dr.sqrt(kernel.minor_variance) * (1 / CELLS)
-        by_spread = spread * dr.opaque(mi.Float, DETAIL / self.slope)
+        """Index of the level that answers a query, the coarsest that footprint or spread allows.
+
+        Args:
+            kernel: the footprint, in texels.
+            spread: standard deviation of the light's spread of projected normals.
+        """
+        by_footprint = dr.sqrt(kernel.minor_variance) * (1 / CELLS_PER_SIGMA)
+        by_spread = spread * dr.opaque(mi.Float, NORMALS_PER_SPREAD / self.slope)
         level = dr.round(dr.log2(dr.maximum(by_footprint, by_spread)))
         return mi.UInt32(dr.clip(level, 0, self.count - 1))
 
@@ -134,8 +142,8 @@ class Levels:
         """The density of the projected normal ``m``.
 
         Args:
-            query: with a footprint in the UV space of the map.
-            variance: of the normals of a flat place, in every direction.
+            query: the query; its footprint is in the UV space of the map.
+            variance: intrinsic roughness σ_r², the variance of each component of a flat element.
         """
         footprint, turn = query.footprint, query.turn
         height, width = self.texels.y, self.texels.x
@@ -157,11 +165,11 @@ class Levels:
                 turn[0, 0] / size.x, turn[0, 1] / size.y, turn[1, 0] / size.x, turn[1, 1] / size.y
             )
 
-        margin = REACH * widest
+        margin = MARGIN * widest
         if turn is not None:
-            # The half vector's own way over the footprint.
-            way = [dr.squared_norm(turn @ v) for v in (kernel.du, kernel.dv)]
-            margin = margin + sqrt(CUT) * dr.sqrt(way[0] + way[1])
+            # The half vector turns this far over the footprint.
+            turned = [dr.squared_norm(turn @ v) for v in (kernel.du, kernel.dv)]
+            margin = margin + sqrt(CUT) * dr.sqrt(turned[0] + turned[1])
         active = mi.Bool(active) & dr.all((m > self.lower - margin) & (m < self.upper + margin))
 
         mean = mi.Vector2f(kernel.mean)
@@ -215,8 +223,8 @@ class Levels:
 
 
 def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int, mi.Float]:
-    """The element that stands at any index along an axis of ``count``, and the sign of its
-    derivatives along it."""
+    """The stored index for any index along an axis of ``count`` elements, and the factor on the
+    element's derivatives along the axis: 1, −1 where it is mirrored, 0 beyond a clamped border."""
     if wrap_mode == "clamp":
         inside = (index >= 0) & (index < count)
         return dr.clip(index, 0, count - 1), dr.select(inside, mi.Float(1), 0)
@@ -228,8 +236,8 @@ def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int,
     return dr.select(beyond, period - 1 - index, index), dr.select(beyond, mi.Float(-1), 1)
 
 
-def texels(data: mi.TensorXf, wrap_mode: str) -> Raw:
-    """Level 0: one element per texel, whose Jacobian is that of central differences."""
+def finest_level(data: mi.TensorXf, wrap_mode: str) -> RawMoments:
+    """Level 0: one element per texel; central differences give its Jacobian."""
     height, width, _ = data.shape
     index = dr.arange(mi.Int, width * height)
     pitch = dr.opaque(mi.Int, width)
@@ -253,18 +261,18 @@ def texels(data: mi.TensorXf, wrap_mode: str) -> Raw:
     nn = [n[i] * n[j] + variance * (jx[i] * jx[j] + jy[i] * jy[j]) for i, j in PAIRS]
     nx, ny = ([variance * j for j in js] for js in (jx, jy))
     dr.eval(n, nx, ny, nn)
-    return Raw(n, nx, ny, nn, (width, height), (1.0, 1.0))
+    return RawMoments(n, nx, ny, nn, (width, height), (1.0, 1.0))
 
 
-def merged(raw: Raw, axis: int, wrap_mode: str) -> Raw:
-    """The elements of half as many places along an axis (0: x)."""
+def merged(raw: RawMoments, axis: int, wrap_mode: str) -> RawMoments:
+    """A level with half as many elements along an axis (0: x, 1: y)."""
     count, spacing = raw.counts[axis], raw.spacing[axis]
     if count == 1:
         return raw
     new_count = ceil(count / 2)
     ratio = count / new_count
-    variance = SIGMA_H**2 * (ratio**2 - 1)  # of the taps, in elements
-    reach = ceil(TAPS * sqrt(variance))
+    variance = SIGMA_H**2 * (ratio**2 - 1)  # of the Gaussian that merges, in elements
+    reach = ceil(MERGE_REACH * sqrt(variance))
     columns, rows = raw.counts
     new_counts = (new_count, rows) if axis == 0 else (columns, new_count)
 
@@ -305,12 +313,15 @@ def merged(raw: Raw, axis: int, wrap_mode: str) -> Raw:
     dr.eval(n, nx, ny, nn)
     new_spacing = spacing * ratio
     spacings = (new_spacing, raw.spacing[1]) if axis == 0 else (raw.spacing[0], new_spacing)
-    return Raw(n, nx, ny, nn, new_counts, spacings)
+    return RawMoments(n, nx, ny, nn, new_counts, spacings)
 
 
-def central(raw: Raw) -> mi.Float:
-    """The numbers of each element: mean; Jacobian per cell, columns x and y; a root (a, b; 0, c) of
-    the residual covariance."""
+def elements_of(raw: RawMoments) -> mi.Float:
+    """The elements with these moments, :data:`NUMBERS` floats each.
+
+    These are the mean; the Jacobian per cell, first its x column, then its y column; and a, b, c of
+    the residual covariance a² = xx, a b = xy, b² + c² = yy.
+    """
     (nx, ny), variance = raw.n, SIGMA_H**2
     jx = [v * (1 / (variance * raw.spacing[0])) for v in raw.nx]
     jy = [v * (1 / (variance * raw.spacing[1])) for v in raw.ny]
@@ -318,8 +329,8 @@ def central(raw: Raw) -> mi.Float:
         product - raw.n[i] * raw.n[j] - variance * (jx[i] * jx[j] + jy[i] * jy[j])
         for product, (i, j) in zip(raw.nn, PAIRS, strict=True)
     )
-    # Differences of numbers up to 1 keep no more digits than that: a covariance of rounding errors
-    # alone must not be divided by itself.
+    # A difference of numbers up to 1 has the rounding error of these numbers. Where the covariance
+    # is nothing but this error, b must not become a quotient of errors.
     a = dr.sqrt(dr.maximum(xx, 0) + ROUNDING)
     b = xy / a
     c = dr.sqrt(dr.maximum(yy - b * b, 0) + ROUNDING)

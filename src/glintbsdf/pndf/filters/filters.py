@@ -1,9 +1,9 @@
-"""The smooth filters of normal maps that are in use: one lobe in place of the P-NDF.
+"""The classic filters of normal maps: one smooth lobe in place of the P-NDF.
 
 Akenine-Möller et al., "Real-Time Rendering" (RTR), 4th edition, 2018, section 9.13.1. Each filter
-keeps some moments of the normals under the footprint (:mod:`glintbsdf.pndf.filters.moments`) and
-turns their averages, with the roughness α of the material between the texels' normals, into a lobe
-(:mod:`glintbsdf.microfacet.slope_distribution`). Where a paper speaks of the variance σ² of slopes,
+averages some moments of the normals under the footprint (:mod:`glintbsdf.pndf.filters.moments`).
+From the averages, and the base roughness α of the material, it makes a lobe
+(:mod:`glintbsdf.microfacet.slope_distribution`). Where a paper uses the variance σ² of slopes, here
 α² = 2σ².
 """
 
@@ -34,45 +34,47 @@ from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
 
 
 def slope(s) -> list:
-    """``m_xy / m_z`` of the projected normal s."""
+    """The slope ``m_xy / m_z`` of the projected normal s."""
     return list(s * dr.rsqrt(1 - dr.squared_norm(s)))
 
 
 def unit_normal(s) -> list:
-    """The unit normal, as (x, y, 1 − z): near z = 1 no digit is lost."""
+    """The unit normal of the projected normal s, as (x, y, 1 − z): near z = 1 no digit is lost."""
     squared = dr.squared_norm(s)
     return [s.x, s.y, squared / (1 + dr.sqrt(1 - squared))]
 
 
-#: The variances along the first and the second axis.
+#: Variances of slopes along u and v.
 VARIANCES: Spread = (((0, 0),), ((1, 1),))
 
-#: LEAN (Olano and Baker 2010): these, and the covariance.
+#: Variances of slopes along u and v, and their covariance; LEAN keeps these (Olano and Baker 2010).
 COVARIANCE: Spread = (*VARIANCES, ((0, 1),))
 
-#: The sum of the variances of slopes; half of it is what CLEAN keeps (Baker, "Spectacular Specular:
-#: LEAN and CLEAN Specular Highlights", GDC 2011).
+#: Sum of the variances of slopes; CLEAN keeps half of it (Baker, "Spectacular Specular: LEAN and
+#: CLEAN Specular Highlights", GDC 2011).
 TOTAL: Spread = (((0, 0), (1, 1)),)
 
-#: The same of unit normals: ``1 − l²``, if their mean has the length l.
+#: Sum of the variances of the components of unit normals. It is ``1 − l²``, where l is the length
+#: of their mean.
 TOTAL_3D: Spread = (((0, 0), (1, 1), (2, 2)),)
 
 
 # ------------------------------------------------------------------------------------------------
-#  Lobes: functions of averages of moments, α² and the distribution
+#  Lobes: functions of the averages of moments, of α² and of the name of the distribution
 # ------------------------------------------------------------------------------------------------
 
 
 def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
     """LEAN (Olano and Baker 2010): ``Ω/2 = E[x xᵀ] − b bᵀ + (α²/2) I``.
 
-    In float32 |Ω| is known to some 1e-7 of the product of both variances: where all slopes lie on
-    one slanting line, lobes of α < 1e-3 are wider or narrower than they should be.
+    Ω is the lobe's squared roughness, a 2×2 matrix; x a slope, b the mean slope. In float32 |Ω| is
+    accurate to some 1e-7 of the product of both variances. So lobes with α < 1e-3 are too wide or
+    too narrow where all slopes lie on one oblique line.
     """
     x, y, variance_u, variance_v, cross = averages
     variance_u, variance_v = positive(variance_u), positive(variance_v)
     uu, vv, uv = alpha_squared + 2 * variance_u, alpha_squared + 2 * variance_v, 2 * cross
-    # |Ω|, with the determinant of the covariance kept from falling below zero by rounding.
+    # |Ω|; rounding must not make the covariance's determinant negative.
     determinant = alpha_squared * (alpha_squared + 2 * (variance_u + variance_v)) + 4 * positive(
         variance_u * variance_v - cross * cross
     )
@@ -80,7 +82,7 @@ def lean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> Slo
 
 
 def clean_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
-    """CLEAN (Baker 2011): as LEAN, with the mean of both variances along every direction."""
+    """CLEAN (Baker 2011): as LEAN, with the mean of both variances in every direction."""
     x, y, total = averages
     return round_lobe(mi.Vector2f(x, y), alpha_squared + positive(total), distribution)
 
@@ -89,8 +91,8 @@ def variance_lobe(averages: list, alpha_squared: mi.Float, distribution: str) ->
     """Variance mapping (RTR 9.13.1; Hill, SIGGRAPH course 2012): ``α'² = α² + 2 variance`` along u
     and v.
 
-    The variances are those that the map's MIP levels hold: what lies between samples of the map,
-    and between lookups, is not counted.
+    The variances are those in the map's MIP levels. The variance that means add from one sample to
+    the next, and from one lookup to the next, is not counted.
     """
     x, y, variance_u, variance_v = averages
     uu, vv = alpha_squared + 2 * positive(variance_u), alpha_squared + 2 * positive(variance_v)
@@ -98,13 +100,14 @@ def variance_lobe(averages: list, alpha_squared: mi.Float, distribution: str) ->
 
 
 def toksvig_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
-    """Toksvig's (2005), RTR Eq. 9.76: the shorter the mean normal, of length l, the rougher.
+    """Toksvig (2005), RTR Eq. 9.76: the shorter the mean normal, the rougher the lobe.
 
-    ``α_p' = l α_p / (l + α_p (1 − l))`` for the exponent of Blinn and Phong, which stands for a
-    roughness by ``α_p = 2/α² − 2`` (Walter et al. 2007); RTR uses the same for GGX. Written for α:
-    with k = (1 − l)/l, ``α'² = (α² + 2k (1 − α²)) / (1 + 2k (1 − α²))``.
+    The mean normal has the length l. RTR gives ``α_p' = l α_p / (l + α_p (1 − l))`` for the
+    exponent of Blinn and Phong. The exponent of a roughness is ``α_p = 2/α² − 2`` (Walter et al.
+    2007); RTR uses the same for GGX. With k = (1 − l)/l this is ``α'² = (α² + 2k (1 − α²)) / (1 +
+    2k (1 − α²))``.
     """
-    x, y, shortfall, variance = averages  # shortfall: of z below 1; variance: 1 − l²
+    x, y, shortfall, variance = averages  # shortfall: mean of 1 − z; variance: 1 − l²
     length = dr.sqrt(x * x + y * y + dr.square(1 - shortfall))
     k = positive(variance) / ((1 + length) * length)
     widened = 2 * k * (1 - alpha_squared)
@@ -113,10 +116,11 @@ def toksvig_lobe(averages: list, alpha_squared: mi.Float, distribution: str) -> 
 
 
 def lobe_about_normal(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
-    """The lobe of an isotropic roughness about a normal of slope b, rather than about the vertical.
+    """The lobe of an isotropic roughness about a normal of slope b = ``mean``.
 
-    The tangent of a rotation takes a roughness from the plane across that normal to the plane of
-    slopes: ``Ω = α² (1 + |b|²) (I + b bᵀ)``, wider along b than across.
+    The roughness α is that of slopes over the plane across this normal. The derivative of the
+    rotation to the vertical takes it to slopes over the surface:
+    ``Ω = α² (1 + |b|²) (I + b bᵀ)``, which is wider along b than across.
     """
     stretch = 1 + dr.squared_norm(mean)
     scale = alpha_squared * stretch
@@ -125,7 +129,7 @@ def lobe_about_normal(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: 
 
 
 def round_lobe(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) -> SlopeLobe:
-    """The lobe of an isotropic roughness."""
+    """The lobe of an isotropic roughness in the plane of slopes."""
     zero = mi.Float(0)
     return SlopeLobe(
         mean, alpha_squared, alpha_squared, zero, dr.square(alpha_squared), distribution
@@ -144,8 +148,13 @@ def positive(x):
 
 @dataclass(frozen=True)
 class Method:
-    """What a filter averages, whether it counts what lies between lookups, and the lobe it makes of
-    the averages; see :class:`~.MomentPyramid`."""
+    """A filter: the moments and products that it averages, and the lobe that it makes of them.
+
+    Attributes:
+        moments, spread, between: as the arguments of :class:`~.MomentPyramid`.
+        lobe: function of the averages, α² and the name of the distribution.
+        distributions: the distributions that the filter is defined for.
+    """
 
     moments: Callable
     spread: Spread
@@ -154,7 +163,7 @@ class Method:
     between: bool = True
 
 
-#: Distributions are those that a method's authors, or RTR, define it for.
+#: The filters by name. Their distributions are the ones that their authors, or RTR, define.
 METHODS = {
     "toksvig": Method(unit_normal, TOTAL_3D, toksvig_lobe, DISTRIBUTIONS),
     "lean": Method(slope, COVARIANCE, lean_lobe),
@@ -166,26 +175,27 @@ METHODS = {
 
 @register("filters", title="filters", plugin="glint_filtered")
 class Filtered(PNDF):
-    """A P-NDF that is one lobe, by one of the filters of RTR 9.13.1.
+    """A P-NDF that is a single lobe, by one of the filters of RTR 9.13.1.
 
-    Belongs to the variant of Mitsuba that is active when it is made.
+    It belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
-        normal_map (NormalMap): the map; slopes up to 1000.
+        normal_map (NormalMap): the map, with slopes up to 1000.
         method (str): one of :data:`METHODS`.
-        alpha (float): roughness of the material, > 0; Toksvig's formula ends at 1.
+        alpha (float): base roughness of the material, > 0, and ≤ 1 for ``toksvig``.
         distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
         max_anisotropy (float): ≥ 1, see :class:`~.MomentPyramid`.
         owner (str): the name that errors give, usually the plugin's.
-        domain (Domain): what will be asked; None for anything. MIP levels that no such footprint
-            needs are then left out. Lobes within the domain are the same to the last bit.
+        domain (Domain): the queries to expect; None for any. MIP levels that none of them needs are
+            left out. Lobes within the domain are the same to the last bit.
 
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
             change of its values, :meth:`parameters_changed` rebuilds the MIP chain.
-        alpha (mi.Float): the roughness.
+        alpha (mi.Float): the base roughness.
 
-    Raises :class:`~.ParameterError`.
+    Raises:
+        ParameterError: an argument is out of range, or the map is too steep.
     """
 
     normal_map: NormalMap
@@ -222,7 +232,7 @@ class Filtered(PNDF):
         self.build(domain)
 
     def build(self, domain: Domain | None = None) -> None:
-        """Check the slopes, and make the MIP chain of ``self.data``."""
+        """Check the slopes of ``self.data``, and build its MIP chain."""
         self.domain = domain
         z_squared = 1 - (self.normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
         check_texels(
@@ -242,7 +252,7 @@ class Filtered(PNDF):
         )
 
     def check_alpha(self) -> None:
-        """Raise unless the roughness is in the method's range."""
+        """Raise :class:`~.ParameterError` unless the roughness is in the method's range."""
         limit = 1 if self.name == "toksvig" else inf
         check(
             dr.all(dr.isfinite(self.alpha) & (self.alpha > 0) & (self.alpha <= limit)),
@@ -258,7 +268,7 @@ class Filtered(PNDF):
         return query.once((self, "lobe"), lambda: self.make_lobe(query))
 
     def make_lobe(self, query: Query) -> SlopeLobe:
-        """What :meth:`lobe` returns."""
+        """Compute what :meth:`lobe` returns."""
         averages = self.pyramid.average(query)
         alpha = query.parameter("alpha", self.alpha)
         return self.method.lobe(averages, dr.square(alpha), self.distribution)
@@ -270,25 +280,26 @@ class Filtered(PNDF):
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """Draw a projected normal with density D: the normals visible from straight above."""
+        """Draw a projected normal with density D: one that is visible from the vertical."""
         above = mi.Vector3f(0, 0, 1)
         normal = self.lobe(query).sample_visible(above, sample1, sample2)
         return mi.Vector2f(normal.x, normal.y)
 
     def sample_visible(self, wi, query, sample1, sample2, active):
-        """One of the normals of the lobe that the view sees."""
+        """Draw one of the lobe's normals that are visible from ``wi``."""
         return self.lobe(query).sample_visible(wi, sample1, sample2)
 
     def visible_pdf(self, wi, m, density, query, active):
         return self.lobe(query).visible_pdf(wi, m, density)
 
     def projected_areas(self, directions, query, active):
-        """Those of the lobe."""
+        """The projected areas and the mean slope of the lobe."""
         lobe = self.lobe(query)
         return [lobe.visible_area(w) for w in directions], lobe.mean
 
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
-        """``footprint``: LEADR's, for every lobe. ``smith``: without LEADR's projection."""
+        """``footprint`` is LEADR's masking, for every filter. ``smith`` is the same without LEADR's
+        projection factor; LEADR itself always has the factor."""
         if name == "smith" and self.name != "leadr":
             return LobeMasking(self, height_correlated)
         return super().masking("footprint" if name == "smith" else name, height_correlated)
@@ -298,7 +309,7 @@ class Filtered(PNDF):
         callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check what has changed, and rebuild. Derivatives keep flowing."""
+        """Check what has changed, and rebuild. Derivatives keep flowing to the parameters."""
         self.check_alpha()
         if not keys or "data" in keys:
             self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
@@ -322,19 +333,20 @@ class Filtered(PNDF):
 
 
 # ------------------------------------------------------------------------------------------------
-#  Masking as it was before the mean plane took the surface's place
+#  Masking relative to the geometric surface
 # ------------------------------------------------------------------------------------------------
 
 
 class LobeMasking(SmithMasking):
-    """Smith's masking by the facets of a lobe, in the reflection of the geometric surface.
+    """Smith's masking by the facets of a lobe, without LEADR's projection factor.
 
-    Λ = P/P̄ − 1 is that of the lobe about its mean facet, but ``cosθ_i`` stays in the denominator of
-    the BRDF: a footprint that leans towards the viewer reflects more than it receives, one that
-    leans away less. 0 where the mean facet faces away from the viewer or the light.
+    Λ = P/P̄ − 1 compares the facets with their mean facet, but the BRDF keeps ``cosθ_i`` of the
+    geometric surface in its denominator. So a footprint that leans towards the viewer reflects more
+    than it receives, and one that leans away reflects less. The masking is 0 where the mean facet
+    faces away from the viewer or from the light.
 
     Args:
-        pndf (Filtered): whose lobe.
+        pndf (Filtered): the P-NDF whose lobe gives the facets.
         height_correlated: see :class:`~.SmithMasking`.
     """
 

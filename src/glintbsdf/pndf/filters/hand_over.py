@@ -1,4 +1,4 @@
-"""From glints to their smooth limit: a P-NDF up to some size of the footprint, its lobe beyond."""
+"""From glints to their smooth limit: a P-NDF for small footprints, and one lobe for large ones."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.base import PNDF
 from glintbsdf.pndf.filters.filters import Filtered
 
-#: Roughness of the lobe besides that of the map: almost none, as a P-NDF has none of its own.
+#: Base roughness of the lobe: almost none, as the P-NDF has only the roughness of the map.
 ALPHA = 1e-3
 
 
 class HandOver(PNDF):
-    """A mixture of a P-NDF and LEAN's lobe of the same map, by the size of the footprint.
+    """A mixture of a P-NDF and LEAN's lobe of the same map, weighted by the footprint's size.
 
     The size is the geometric mean of the footprint's standard deviations along its axes, in texels.
-    Up to ``sigma`` there is the P-NDF alone, from twice that size on the lobe alone, which costs
-    the same for every footprint; between them their mixture, whose weight is smooth in the
-    logarithm of the size. Evaluation and sampling mix alike.
+    Up to the size ``sigma``, D is the P-NDF. From twice that size on it is the lobe, which costs
+    the same for every footprint. Between them it is a mixture, whose weight is smooth in the
+    logarithm of the size. Evaluation and sampling use the same weight.
 
     Args:
         near: the P-NDF of a normal map.
-        sigma (float): texels, > 0.
+        sigma (float): size of the footprint, texels, > 0.
         owner (str): the name that errors give, usually the plugin's.
-        domain (Domain): what will be asked, see :class:`Filtered`.
+        domain (Domain): the queries to expect, see :class:`Filtered`.
+
+    Raises:
+        ParameterError: ``sigma`` is not positive; the message calls it ``hand_over``.
     """
 
     def __init__(
@@ -40,7 +43,7 @@ class HandOver(PNDF):
         self.near, self.sigma, self.owner, self.domain = near, float(sigma), owner, domain
         self.far = Filtered(near.normal_map, "lean", alpha=ALPHA, owner=owner, domain=domain)
 
-    # What is asked of a P-NDF of a normal map.
+    # These are the P-NDF's own.
     data = property(lambda self: self.near.data)
     normal_map = property(lambda self: self.near.normal_map)
     kernel = property(lambda self: self.near.kernel)
@@ -53,7 +56,7 @@ class HandOver(PNDF):
             part.build(domain)
 
     def weight(self, query: Query | Footprint) -> mi.Float:
-        """The lobe's share of the mixture, from 0 to 1."""
+        """The lobe's weight in the mixture, in [0, 1]."""
         height, width, _ = self.data.shape
         wrap_mode = self.normal_map.wrap_mode
         kernel = Query.of(query).texel_kernel("gaussian", height, width, wrap_mode)
@@ -87,7 +90,7 @@ class HandOver(PNDF):
         return self.near.smooth()
 
     def projected_areas(self, directions, query, active):
-        """Those of the map's facets, which the lobe has as well."""
+        """The projected areas of the map's facets; the lobe has almost the same."""
         return self.near.projected_areas(directions, query, active)
 
     def masking(self, name: str, height_correlated: bool = True):
@@ -97,7 +100,7 @@ class HandOver(PNDF):
         self.near.traverse(callback)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check new data, and rebuild."""
+        """Check new data, and rebuild both."""
         self.near.parameters_changed(keys)
         if not keys or "data" in keys:
             self.far.data = self.near.data
@@ -106,7 +109,7 @@ class HandOver(PNDF):
             self.far.build(self.domain)
 
     def parts(self) -> dict[str, int]:
-        """Memory of each part of both, bytes; the map is the same."""
+        """Memory of each part of both, bytes; they share the map, which counts once."""
         return {**self.far.parts(), **self.near.parts()}
 
     def __repr__(self) -> str:

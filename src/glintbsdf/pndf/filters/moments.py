@@ -1,24 +1,20 @@
 """MIP chains of a map's moments, and their averages under a Gaussian footprint.
 
-A filter of normal maps keeps a few numbers of the normals, averages them over the footprint, and
-makes a lobe of the averages. Here is the averaging, whatever the numbers are.
+A filter of normal maps averages a few moments of the normals over the footprint, and makes a lobe
+of the averages. This module averages, whatever the moments are.
 
-The footprint is a Gaussian, so the chain is one of Gaussians as well: level 0 holds the texels,
-level ℓ ≥ 1 the averages over an isotropic Gaussian of standard deviation :func:`level_sigma` (ℓ),
-of the continuous map, triangles between texel centres, not of its texels alone. A footprint that
-is a level's Gaussian around one of its texels gets exact averages; one between is a mixture of two
-levels with the footprint's variance. Stretched footprints are sums of such lookups along the major
-axis, as texture hardware does (Heckbert, "Fundamentals of Texture Mapping and Image Warping",
-1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping", SIGGRAPH
-1999).
+The footprint is a Gaussian, and so are the levels of the chain. Level 0 holds the texels. Level
+ℓ ≥ 1 holds averages over an isotropic Gaussian of standard deviation :func:`level_sigma` (ℓ). They
+are averages of the continuous map, which has triangles between texel centres. The averages are
+exact for a footprint that equals a level's Gaussian around one of its samples. Any other round
+footprint is a mixture of two levels that has the footprint's variance. A stretched footprint is a
+sum of such lookups along its major axis, as in texture hardware (Heckbert, "Fundamentals of Texture
+Mapping and Image Warping", 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic
+Texture Mapping", SIGGRAPH 1999).
 
-Accuracy (``python -m benchmarks accuracy moments``, 512² maps from isotropic to scratched): where
-the minor axis has a standard deviation of at least 1.2 texels, and a 16th of the major one, the
-slopes' first and second moments are those of the continuous map under the footprint to 0.6 % and
-0.9 %, root mean square over random footprints, relative to the map's root mean square slope and to
-its square. Narrower footprints mix the texels themselves in, whose mean squares exceed those of the
-interpolated normals: 1 to 9 % off at one texel, 2 to 42 % at half a texel. Levels of half a texel
-would mend that, for 2.9 times the memory.
+``python -m benchmarks accuracy moments`` measures the accuracy. Footprints narrower than a texel
+mix in the texels themselves. Their mean squares exceed those of the interpolated normals, so these
+footprints are the least accurate.
 
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
@@ -42,30 +38,34 @@ from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
 
-#: Standard deviation of a level over that of the one before.
+#: Ratio of the standard deviations of two successive levels.
 RATIO = 2 ** (1 / 3)
 
-#: Spacing of a level's samples over its standard deviation, at most, where that exceeds a texel.
+#: Largest spacing of a level's samples, in standard deviations of the level. It is never less than
+#: a texel.
 SPACING = 0.8
 
-#: Level texels beyond the border of a map that is not periodic: there its border has faded out.
+#: Samples of a level beyond each border of a map that is not periodic. Farther out, the averages
+#: are constant.
 BORDER = 6
 
-#: Where a Gaussian that makes a level from a finer one is cut, in standard deviations.
+#: Cut of the Gaussian that makes a level from a finer one, in standard deviations.
 CUT = 4.0
 
-#: Distance of two lookups along the major axis, at most, in standard deviations of a lookup (a sum
-#: of Gaussians ripples by 5 % at 2.3), and how far they reach, in standard deviations of the whole.
+#: Largest distance between lookups along the major axis, in standard deviations of a lookup: the
+#: sum of Gaussians at this distance ripples by 5 %. Reach of the lookups, in standard deviations of
+#: the Gaussian that they must add to a single one.
 STEP, REACH = 2.3, 2.3
 
-#: The same reach where there is one lookup on either side of the middle, which comes nearest to the
-#: variance; it serves as long as what it adds is no wider than a lookup.
+#: Reach where there is one lookup on either side of the middle: this one keeps the variance best.
+#: One is enough while the Gaussian to add is no wider than a lookup.
 REACH_OF_ONE = sqrt(3)
 
-#: Footprints whose major axis has a variance of 1 + ROUND² minor ones at most count as round.
+#: A footprint counts as round if the variance along its major axis is at most 1 + ROUND² times the
+#: variance along its minor axis.
 ROUND = 0.5
 
-#: No lookup is narrower than this (standard deviation, texels): the texels are interpolated.
+#: Smallest standard deviation of a lookup, texels, as texels are interpolated.
 SIGMA_LOOKUP = 0.5
 
 #: Keeps the derivative of a root finite where a footprint is round (texels⁴).
@@ -78,9 +78,10 @@ def level_sigma(level: int) -> float:
 
 
 def level_below(variance):
-    """The coarsest level fine enough for a lookup of this variance (texels²), which may be < 0.
+    """The coarsest level that is fine enough for a lookup of this variance (texels²).
 
-    Fine enough with half of what interpolating adds at most.
+    A level counts with its variance and half of the largest variance that interpolation adds. The
+    result is < 0 for variances below level 0.
     """
     return dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1
 
@@ -89,22 +90,24 @@ def level_below(variance):
 #  Central second moments
 # ------------------------------------------------------------------------------------------------
 #
-# A variance that is the difference of two averages, E[x²] − E[x]², has lost the digits in which
-# both agree. So what is kept are means, and then products of deviations from them; whoever averages
-# such records takes all of them about one origin, one of the means, first (Chan, Golub and LeVeque,
-# "Algorithms for Computing the Sample Variance", The American Statistician 1983).
+# A variance that is a difference of two averages, E[x²] − E[x]², has lost the digits in which both
+# agree. So a record holds means, and averages of products of deviations from these means. To
+# average records, all of them are first moved to one origin, which is one of the means (Chan, Golub
+# and LeVeque, "Algorithms for Computing the Sample Variance", The American Statistician 1983).
 
 #: For each product that is kept, the pairs of means whose deviations are multiplied and summed.
 Spread = tuple[tuple[tuple[int, int], ...], ...]
 
 
 def origin_of(record: list, spread: Spread) -> list:
-    """The means of a record, for an origin; it is a constant, on which no average depends."""
+    """The means of a record, to be used as an origin. Averages do not depend on the origin, so it
+    carries no derivatives."""
     return dr.detach(record[: len(record) - len(spread)]) if spread else []
 
 
 def about(origin: list, record: list, spread: Spread) -> list:
-    """A record with means and products about ``origin``, whose averages can be taken."""
+    """A record moved to ``origin``: means and products of deviations from it. Such records can be
+    averaged."""
     if not spread:
         return record
     deviations = [mean - x for mean, x in zip(record, origin, strict=False)]
@@ -116,7 +119,7 @@ def about(origin: list, record: list, spread: Spread) -> list:
 
 
 def central(origin: list, averages: list, spread: Spread) -> list:
-    """The record that averages about ``origin`` stand for."""
+    """The inverse of :func:`about`, for the averages of such records."""
     if not spread:
         return averages
     deviations, products = averages[: len(origin)], averages[len(origin) :]
@@ -135,7 +138,7 @@ def central(origin: list, averages: list, spread: Spread) -> list:
 class SampleAxis:
     """``count`` samples at ``origin + k spacing`` (texels) along one axis.
 
-    Beyond them they repeat, or the outermost go on for ever.
+    The samples repeat if the axis is periodic; otherwise the outermost ones continue.
     """
 
     count: int
@@ -145,22 +148,22 @@ class SampleAxis:
 
     @cached_property
     def samples(self) -> mi.Int:
-        """``count`` for kernels, which are the same for maps of all sizes."""
+        """``count`` as an opaque value: one kernel serves maps of all sizes."""
         return opaque(mi.Int, self.count)
 
     @cached_property
     def inverse_count(self) -> mi.Float:
-        """1/``count`` for kernels."""
+        """1/``count`` as an opaque value."""
         return opaque(mi.Float, 1 / self.count)
 
     def divided(self, index):
-        """Row and column (``mi.UInt32``) of an index to rows of ``count`` samples."""
+        """Row and column (``mi.UInt32``) of an index into rows of ``count`` samples."""
         columns = mi.UInt32(self.samples)
         row = index // columns
         return row, index - row * columns
 
     def wrapped(self, index):
-        """The sample that stands at any ``mi.Int`` index."""
+        """The index of the stored sample that stands at any ``mi.Int`` index."""
         if self.periodic:
             turns = floor_int((mi.Float(index) + 0.5) * self.inverse_count)
             return mi.UInt32(index - turns * self.samples)
@@ -168,7 +171,7 @@ class SampleAxis:
 
 
 def level_axis(texels: int, spacing: float, periodic: bool) -> SampleAxis:
-    """The samples of a level with at most this spacing along an axis of ``texels``."""
+    """The samples of a level along an axis of ``texels``; ``spacing`` is the largest allowed."""
     if periodic:
         count = ceil(texels / spacing)
         spacing = texels / count
@@ -189,10 +192,10 @@ def smooth(
 
     Args:
         channels: arrays (``mi.Float``) of rows × columns samples.
-        axes: of rows and of columns.
-        along (int): which of them.
-        target (SampleAxis): where to sample.
-        variance (float): of the Gaussian, texels².
+        axes: the axes of rows and of columns.
+        along (int): index of the axis along which to average.
+        target (SampleAxis): positions of the new samples along that axis.
+        variance (float): variance of the Gaussian, texels².
         spread: see :class:`MomentPyramid`.
     """
     source, other = axes[along], axes[1 - along]
@@ -238,9 +241,9 @@ def all_texels(normals, texels: tuple[SampleAxis, SampleAxis], axes: tuple[Sampl
 
 
 def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAxis]):
-    """What ``over_quad`` makes of the normals at the corners of each quad between four texels.
+    """Averages over each quad between four texels, and the axes of the quads' centres.
 
-    Returns that and the axes of the quads' centres.
+    ``over_quad`` computes them from the normals at the corners.
     """
     # Where the map is not periodic there is a constant quad beyond each border.
     quads = tuple(
@@ -267,15 +270,15 @@ def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAx
 
 
 def record_of(moments: Callable, spread: Spread, normal) -> list:
-    """The record of a single normal, which deviates from nothing."""
+    """The record of a single normal: its moments, and products of deviations that are 0."""
     return moments(normal) + [dr.zeros(mi.Float, dr.width(normal)) for _ in spread]
 
 
 def midpoint_rule(moments: Callable, spread: Spread, corners: list) -> list:
-    """Averages over a quad of moments of its normals, by the midpoints of its triangles' edges.
+    """Averages of moments over a quad, from the midpoints of its triangles' edges.
 
-    Over the two triangles of a quad the projected normal is linear. The rule integrates its
-    quadratic polynomials exactly, and slopes are almost linear in it.
+    The projected normal is linear over each triangle. The rule is exact for quadratic polynomials
+    of it, and slopes are almost linear in it.
     """
     n0, n1, n2, n3 = corners
     edges = ((n1, n2, 2), (n0, n1, 1), (n0, n2, 1), (n1, n3, 1), (n2, n3, 1))
@@ -290,25 +293,25 @@ def midpoint_rule(moments: Callable, spread: Spread, corners: list) -> list:
 
 
 def samples_within(axis: SampleAxis, first: float, last: float) -> tuple[int, int]:
-    """First and number of the samples that an interpolation between two positions (texels) needs.
+    """The samples that interpolation needs between two positions (texels): the first, and how many.
 
-    Those of a periodic axis need not lie within its period.
+    On a periodic axis they may lie outside of the first period.
     """
     low, high = (floor((x - axis.origin) / axis.spacing) for x in (first, last))
-    low, high = low - 1, high + 2  # the sample after, and one more on either side for rounding
+    low, high = low - 1, high + 2  # the next sample, and one more on either side for rounding
     if not axis.periodic:
         low, high = (min(max(k, 0), axis.count - 1) for k in (low, high))
     return low, high - low + 1
 
 
 def samples(window) -> int:
-    """Number of samples in a window, ``(first, number)`` of its rows and of its columns."""
+    """Number of samples in a window: pairs ``(first, number)`` for its rows and for its columns."""
     (_, rows), (_, columns) = window
     return rows * columns
 
 
 def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
-    """The part of a level in a window, which may lie across the border."""
+    """The part of a level in a window, which may cross the border."""
     (top, rows), (left, columns) = window
     if window == tuple((0, axis.count) for axis in axes):
         return level
@@ -322,9 +325,16 @@ def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
 
 
 class LevelSamples(NamedTuple):
-    """Where a level's samples are: the first of a whole level, though it may not be stored, samples
-    stored per row, samples per texel, their number and its inverse, these for x and y; the level's
-    variance (texels²), and half of the squared spacing."""
+    """How a level's samples are stored. Vectors hold a value for x and one for y.
+
+    Attributes:
+        offset: index of the first sample of the whole level, even if only a part is stored.
+        pitch: stored samples per row.
+        scale: samples per texel.
+        counts, inverse_count: number of samples of the whole level, and its inverse.
+        variance: variance of the level's Gaussian, texels².
+        half_square: half of the squared spacing, texels².
+    """
 
     offset: mi.UInt32
     pitch: mi.UInt32
@@ -336,7 +346,8 @@ class LevelSamples(NamedTuple):
 
 
 def principal_axes(kernel: TexelKernel):
-    """Unit vector of the footprint's major axis; variances (texels²) along major and minor axis."""
+    """Unit vector of the footprint's major axis; variances (texels²) along its major and its minor
+    axis."""
     variance_u, variance_v = dr.square(kernel.sigma_u), dr.square(kernel.sigma_v)
     covariance = kernel.shear * variance_v
     mean, difference = 0.5 * (variance_u + variance_v), 0.5 * (variance_u - variance_v)
@@ -348,23 +359,24 @@ def principal_axes(kernel: TexelKernel):
         mi.Vector2f(covariance, radius - difference),
     )
     major = mean + radius
-    # The smaller eigenvalue from the determinant, whose digits the kernel has kept.
+    # The smaller eigenvalue comes from the determinant, which the kernel knows without
+    # cancellation.
     minor = dr.square(kernel.sigma_u_given_v * kernel.sigma_v) / major
     return axis * dr.rsqrt(dr.squared_norm(axis)), major, minor
 
 
 def taps(variance_major, variance):
-    """How to make a Gaussian, stretched along one axis, of round ones of the variance across.
+    """Round Gaussians whose sum is a stretched one, with ``variance`` (texels²) across.
 
-    Returns the variance of a round one, the distance between two, how many there are on either side
-    of the middle, and the ``s`` of their weights ``exp(−s k²)``.
+    Returns the variance of a round Gaussian, the distance between two, how many there are on either
+    side of the middle one, and ``s`` of their weights ``exp(−s k²)``.
     """
     spread = dr.sqrt(dr.maximum(variance_major - variance, 0))
     sigma = dr.maximum(dr.sqrt(variance), SIGMA_LOOKUP)
     one, many = spread > ROUND * sigma, spread > sigma
     steps = dr.select(many, dr.ceil(REACH / STEP * spread / sigma), dr.select(one, 1, 0))
     reach = dr.select(many, REACH / dr.maximum(steps, 1), REACH_OF_ONE)
-    steps = dr.detach(steps)  # constant but for jumps, and a loop counts to it
+    steps = dr.detach(steps)  # a number of loop turns: its derivative is 0 between jumps
     variance = dr.select(one, variance, 0.5 * (variance_major + variance))
     return variance, reach * spread, steps, 0.5 * dr.square(reach)
 
@@ -374,29 +386,30 @@ class MomentPyramid:
 
     Args:
         data (mi.TensorXf): projected normals, H×W×2. Derivatives flow through it.
-        wrap_mode (str): what lies beyond the map's border.
-        moments: function of projected normals (``mi.Vector2f``) that returns a list of ``mi.Float``
-            whose averages are wanted, any number of them. None for a chain without the texels
-            themselves, for footprints no narrower than level 1.
-        spread (Spread): products of deviations from the averages of ``moments``. Their own
-            averages, central second moments, follow in everything that is stored and returned.
-        between (bool): whether what means differ by between samples of the chain, and between
-            lookups, adds to those products.
-        finish: function from the averages of a sample of the chain to what is stored there and
-            interpolated; by default the averages themselves.
-        max_anisotropy (float): ratio of the footprint's axes, ≥ 1, beyond which it is widened.
+        wrap_mode (str): how the map continues beyond its border.
+        moments: function of projected normals (``mi.Vector2f``) that returns the moments to
+            average, a list of any number of ``mi.Float``. None for a chain without level 0, for
+            footprints no narrower than level 1.
+        spread (Spread): products of deviations from the averages of ``moments``. Their averages,
+            which are central second moments, follow the averages of ``moments`` in all records.
+        between (bool): whether central second moments include the differences of means between
+            samples of the chain, and between lookups.
+        finish: function of the averages of a sample that returns the values to store and to
+            interpolate; by default the averages themselves.
+        max_anisotropy (float): largest ratio of the footprint's axes, ≥ 1. A longer footprint is
+            widened across.
         over_quad: function of the normals at the corners of a quad that returns the averages over
-            it; by default that of ``moments`` by :func:`midpoint_rule`.
-        first (int): the finest level; by default the texels, or 1 without them. A footprint that is
-            narrower is widened.
-        records: what is averaged, of each texel of a map that repeats, instead of ``over_quad``:
-            one ``mi.Float`` of H·W numbers per channel.
-        domain (Domain): what will be asked for; levels and parts of levels that no such footprint
-            needs are left out. What lies within the domain has the same averages to the last bit.
+            the quad; by default :func:`midpoint_rule` of ``moments``.
+        first (int): the finest level; by default 0, or 1 without ``moments``. A narrower footprint
+            is widened.
+        records: for a map that repeats, the values of each texel to average in place of
+            ``over_quad``: one ``mi.Float`` of H·W numbers per channel.
+        domain (Domain): the queries to expect. Levels and parts of levels that none of them needs
+            are left out. Averages within the domain are the same to the last bit.
 
     Attributes:
         first, top (int): finest and coarsest level.
-        nbytes (int): memory of the chain.
+        nbytes (int): memory of the chain, bytes.
     """
 
     def __init__(
@@ -465,10 +478,11 @@ class MomentPyramid:
     def choose_windows(
         self, shapes: list[tuple[SampleAxis, SampleAxis]], domain: Domain | None
     ) -> list:
-        """What to store of each level: ``(first, number)`` of the rows, and of the columns.
+        """The part of each level to store: ``(first, number)`` of its rows, and of its columns.
 
-        All of all levels, or what lies within the domain, if that is less. It may lie across the
-        border of a periodic level, and is stored as it lies: lookups need not wrap then.
+        These are the whole levels, or their parts within the domain if these are smaller. A part
+        may cross the border of a periodic level. It is stored in one piece, so that lookups need
+        not wrap.
         """
         whole = [tuple((0, axis.count) for axis in axes) for axes in shapes]
         self.wraps = self.periodic
@@ -485,7 +499,7 @@ class MomentPyramid:
         return parts
 
     def one_period(self, data):
-        """Projected normals, rows and columns of the map, or of the period of a mirrored one."""
+        """Projected normals, rows and columns of one period: the map, or four mirrored copies."""
         if self.wrap_mode != "mirror":
             return data.array, self.height, self.width
         index = dr.arange(mi.UInt32, 4 * self.height * self.width)
@@ -500,9 +514,10 @@ class MomentPyramid:
     def store(
         self, levels: list[list], shapes: list[tuple[SampleAxis, SampleAxis]], windows: list
     ) -> None:
-        """Lay the levels out one after the other, as records of four numbers, and of one each.
+        """Store the levels one after the other, in arrays of four channels, and one of a single
+        channel where one is left.
 
-        ``windows``: of each level ``(first, number)`` of the rows, and of the columns, given.
+        ``windows``: the part of each level, see :meth:`choose_windows`.
         """
         channels = [dr.concat(parts) for parts in zip(*levels, strict=True)]
         dr.eval(channels)
@@ -516,7 +531,7 @@ class MomentPyramid:
         self.single = channels[0] if channels else None
         sizes = [samples(window) for window in windows]
         pitches = [columns for _, (_, columns) in windows]
-        # Of the first sample of the whole level: possibly before all, in arithmetic modulo 2³².
+        # Index of the first sample of the whole level. It may be negative: indices are modulo 2³².
         offsets = [
             (sum(sizes[:k]) - top * columns - left) % 2**32
             for k, ((top, _), (left, columns)) in enumerate(windows)
@@ -541,7 +556,7 @@ class MomentPyramid:
     # --------------------------------------------------------------------------------------------
 
     def average(self, query: Query | Footprint, active: bool | mi.Bool = True) -> list:
-        """What is stored, averaged over a footprint: one ``mi.Float`` per channel.
+        """The stored values, averaged over a footprint: one ``mi.Float`` per channel.
 
         ``query``: a query, or just a footprint in the UV space of the map.
         """
@@ -553,7 +568,7 @@ class MomentPyramid:
         last = opaque(mi.Float, self.top - 1)
         level = dr.clip(level_below(variance), opaque(mi.Float, self.first), last)
         grids = [self.grid(level), self.grid(level + 1)]
-        steps = dr.select(active, steps, -1)  # none at all, as they go from −steps to steps
+        steps = dr.select(active, steps, -1)  # the loop runs from −steps to steps: it does not run
         step = major * step
         origin = self.nearest_means(kernel.mean, grids[0])
 
@@ -569,7 +584,7 @@ class MomentPyramid:
         return central(origin, [total / weights for total in totals], self.spread)
 
     def grid(self, level) -> LevelSamples:
-        """The samples of a level (``mi.Float``)."""
+        """How the samples of a level (``mi.Float``) are stored."""
         index = mi.UInt32(level - opaque(mi.Float, self.first))
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
@@ -585,7 +600,7 @@ class MomentPyramid:
         )
 
     def lookup(self, position, variance, grids, origin: list) -> list:
-        """The mixture, at a position, of a level and the next that has this variance."""
+        """The values at a position (texels), from the mixture of two levels with this variance."""
         (fine, fine_variance), (coarse, coarse_variance) = (
             self.bilinear(position, grid, origin) for grid in grids
         )
@@ -593,8 +608,8 @@ class MomentPyramid:
         return [dr.lerp(a, b, weight) for a, b in zip(fine, coarse, strict=True)]
 
     def corners(self, position, grid: LevelSamples):
-        """First and second sample (``mi.Vector2u``: column, row) of a level on either side of a
-        position along each axis, and where between them it lies, from 0 to 1."""
+        """The samples of a level on either side of a position (texels), along each axis: the first
+        and the second (``mi.Vector2u``: column, row), and the fraction between them, in [0, 1)."""
         count = grid.counts
         place = (position + 0.5) * grid.scale + (-0.5 if self.periodic else BORDER - 0.5)
         corner = dr.floor(place)
@@ -608,14 +623,14 @@ class MomentPyramid:
         return mi.Vector2u(first), mi.Vector2u(second), place - corner
 
     def record(self, index) -> list:
-        """What is stored at an index."""
+        """The values of the sample at an index."""
         values = [x for records in self.records for x in dr.gather(mi.Vector4f, records, index)]
         if self.single is not None:
             values.append(dr.gather(mi.Float, self.single, index))
         return values[: self.channels]
 
     def nearest_means(self, position, grid: LevelSamples) -> list:
-        """The means of a level's sample that is nearest to a position, for an origin."""
+        """The means of the sample nearest to a position (texels), as an origin for the averages."""
         if not self.spread:
             return []
         first, second, f = self.corners(position, grid)
@@ -623,7 +638,8 @@ class MomentPyramid:
         return origin_of(self.record(grid.offset + y * grid.pitch + x), self.spread)
 
     def bilinear(self, position, grid: LevelSamples, origin: list):
-        """What a level says at a position, and the variance (texels²) of the kernel there."""
+        """The values of a level at a position (texels), and the variance (texels²) of the kernel
+        that made them."""
         (x0, y0), (x1, y1), f = self.corners(position, grid)
         rows = [grid.offset + y * grid.pitch for y in (y0, y1)]
         weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
@@ -633,5 +649,6 @@ class MomentPyramid:
         averages = [value * weight[0] for value in records[0]]
         for record, w in zip(records[1:], weight[1:], strict=True):
             averages = [dr.fma(x, w, total) for x, total in zip(record, averages, strict=True)]
-        # Between two samples, weighed 1 − f and f, interpolation adds the variance f (1 − f) h².
+        # Interpolation with the weights 1 − f and f adds the variance f (1 − f) h², for a spacing
+        # h.
         return averages, grid.variance + dr.dot(f * (1 - f), grid.half_square)
