@@ -1,13 +1,15 @@
 """Procedural microdetails on a hierarchy of grids.
 
-Zirr and Kaplanyan, "Real-time Rendering of Procedural Multiscale Materials" (I3D 2016). The surface
-is covered by grids whose cells grow by powers of two, and every cell holds a random, repeatable
-number of microdetails that reflect for the half vector asked for. There is no map, no structure and
-no memory: hashed integers make everything. The functions stand in the paper's order and use its
-symbols; where they depart from it, they say so.
+Zirr and Kaplanyan, "Real-time Rendering of Procedural Multiscale Materials" (I3D 2016). Grids cover
+the surface; their cells grow by powers of two. Of the microdetails in a cell, a random but
+repeatable number reflects for a half vector. There is no map, no structure and no memory: hashes of
+integers make everything. The functions follow the paper's order and use its symbols. Where they
+depart from the paper, they say so. Section 4.1, the coherent hash, is
+:func:`~glintbsdf.core.hashing.coherent_vertex`; Listing 1 is in :class:`Grid`.
 
-Slopes are ``x = m_xy / m_z`` of a unit normal m; α = √2 σ is a Beckmann roughness. Subscripts: g
-the whole surface (global), l one microdetail (local), m the microdetails' centres (mesoscale).
+A slope is ``x = m_xy / m_z`` of a unit normal m; α = √2 σ is a Beckmann roughness. The subscript g
+is for the whole surface (global), l for one microdetail (local), and m for the centres of the
+microdetails (mesoscale).
 """
 
 from __future__ import annotations
@@ -27,28 +29,31 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.smooth import SmoothBeckmann
 
-#: Cells of the coarsest grid are 2⁴⁰ times as wide as those of the finest. They hold 2⁸⁰
-#: microdetails, whose noise is below the last bit of a float: larger footprints need none larger.
+#: Level of the coarsest grid: its cells are 2⁴⁰ times as wide as cells of the finest grid. They
+#: hold 2⁸⁰ microdetails, whose noise is below the last bit of a float.
 MAX_LEVEL = 40
 
-#: The smallest pixel, relative to the largest UV coordinate: four spacings of float32 there.
+#: The smallest pixel, relative to the largest UV coordinate: four spacings of float32 numbers
+#: there.
 UV_RESOLUTION = 2.0**-22
 
-#: Half the shortest median that is walked, in cells. It keeps the weights free of 0/0.
+#: Smallest half length of the median, in cells. It keeps the weights free of 0/0.
 MIN_HALF_MEDIAN = 1e-3
 
-#: What the median loses at each end, in smaller extents of the pixel: the paper's half a cell, and
-#: a little more, so that pixels which are round but for the perspective need no third column.
-SHORTENED = 0.55
+#: The median is shortened at each end by this multiple of the pixel's smaller extent. The paper
+#: takes half a cell. A little more saves the third column of pixels that perspective makes slightly
+#: longer than wide.
+SHORTENING = 0.55
 
 #: The smallest roughness that Mitsuba's Beckmann distribution, which is sampled, can have.
 MIN_ALPHA = 1e-4
 
-#: Expected counts up to this are drawn from the exact binomial distribution, so many terms of it.
+#: Counts with an expectation up to EXACT_MEAN are drawn from the exact binomial distribution, by
+#: its first EXACT_TERMS terms.
 EXACT_MEAN, EXACT_TERMS = 4.0, 10
 
 # ------------------------------------------------------------------------------------------------
-#  Section 3: the biscale Beckmann distribution
+#  Section 3: the biscale Beckmann distribution (Eq. 3 to 6)
 # ------------------------------------------------------------------------------------------------
 
 
@@ -58,7 +63,7 @@ def beckmann(x: mi.Vector2f, alpha: mi.Vector2f) -> mi.Float:
 
 
 def slope_jacobian(cos_theta: mi.Float) -> mi.Float:
-    """From a density of slopes to one of projected normals: |dx/ds| = 1/cos⁴θ (before Eq. 6)."""
+    """The factor 1/cos⁴θ from a density of slopes to one of projected normals (before Eq. 6)."""
     return dr.rcp(dr.square(dr.square(cos_theta)))
 
 
@@ -75,24 +80,26 @@ def mesoscale_roughness(alpha_g: mi.Vector2f, alpha_l: mi.Vector2f) -> mi.Vector
 class CoveredCells:
     """The vertices of two grids that a footprint covers, and their weights (Fig. 3 and 6).
 
-    What the paper calls a cell is here the surrounding of a vertex of the grid, which weighs by a
-    bilinear tent: then a cell and the one of the next coarser grid with the same name have the same
-    centre. The pixel is a rectangle on the principal axes of the footprint, one standard deviation
-    to either side. Its smaller extent selects the grids; the median of the larger one is walked
-    column by column (row by row, where it is steeper than 45°). A column weighs as much of the
-    median, shortened at both ends by ``SHORTENED`` of the smaller extent, as its tent sees; within
-    a column the tents of the two nearest vertices weigh. All weights sum to one and change
-    continuously.
+    The paper's cell is here the neighbourhood of a vertex of the grid, weighted by a bilinear tent.
+    So a vertex has the same position in all grids that it is part of.
+
+    The pixel is a rectangle along the principal axes of the footprint, one standard deviation to
+    either side. Its smaller extent selects the grids. The median along its larger extent is walked
+    column by column, or row by row where it is steeper than 45°. At both ends it is shortened by
+    ``SHORTENING`` times the smaller extent. The weight of a column is the integral of its tent over
+    the median. In a column, the two nearest vertices have the weights of their tents. All weights
+    sum to one and change continuously.
 
     Args:
         footprint (Footprint): the footprint.
         scale (mi.Float): cells of the finest grid per unit of UV.
-        stretch (mi.Vector2f): factors ≤ 1 on the coordinates, after grids have been selected.
-        max_anisotropy (mi.Float): K_a, the largest ratio of the extents; beyond, cells grow.
+        stretch (mi.Vector2f): factors ≤ 1 on the coordinates, applied after the selection of grids.
+        max_anisotropy (mi.Float): K_a, the largest ratio of the extents. Cells grow where the
+            footprint is longer.
 
     Attributes:
-        level (mi.Int): the finer of the two grids: its cells are 2^level times the finest.
-        blend (mi.Float): weight of the coarser one, in [0, 1).
+        level (mi.Int): level of the finer grid: its cells are 2^level times as wide as the finest.
+        blend (mi.Float): weight of the coarser grid, in [0, 1).
     """
 
     def __init__(self, footprint, scale, stretch, max_anisotropy) -> None:
@@ -102,7 +109,7 @@ class CoveredCells:
         major = dr.sqrt(larger_eigenvalue(a, b, c))
         minor = dr.abs(du.x * dv.y - du.y * dv.x) / dr.select(major > 0, major, 1)
 
-        # s_c, in cells of the finest grid; no finer one is needed, as a cell of it is one detail
+        # s_c, in cells of the finest grid, whose cells have one microdetail: none finer is needed
         size = dr.maximum(2 * minor, 2 * major / max_anisotropy)
         size = dr.maximum(size, UV_RESOLUTION * dr.max(dr.abs(footprint.uv)) * scale)
         size = dr.clip(size, 1, limit)
@@ -115,11 +122,11 @@ class CoveredCells:
         self.along_x = a >= c
         rise = squared_major - dr.minimum(a, c)
         self.slope = dr.select(rise > 0, b / dr.select(rise > 0, rise, 1), 0)
-        half = dr.maximum(dr.sqrt(squared_major) - SHORTENED * size, 0)
+        half = dr.maximum(dr.sqrt(squared_major) - SHORTENING * size, 0)
         self.half = half * dr.rsqrt(1 + dr.square(self.slope))
         self.centre = self.swapped(footprint.uv * scale * stretch)
 
-        # With one coordinate stretched to nothing, all vertices lie on a line
+        # With a stretch of 0 along one axis, all vertices lie on a line
         self.rows = 1 if any(is_literal_zero(s) for s in stretch) else 2
 
     def swapped(self, v):
@@ -127,10 +134,11 @@ class CoveredCells:
         return type(v)(dr.select(self.along_x, v.x, v.y), dr.select(self.along_x, v.y, v.x))
 
     def grid(self, level, weight):
-        """What a walk over one grid needs, in its cells, relative to the vertex before the centre.
+        """The median in one grid, in cells of this grid.
 
-        Returns its level and weight, that vertex (p, q), the centre relative to it, half the
-        median along p, the first column and the number of columns.
+        Its origin is the vertex before the centre, along both axes. Returns the grid's level and
+        weight, the origin's p and q, the centre's p and q relative to the origin, the median's half
+        length along p, the first column relative to the origin, and the number of columns.
         """
         spacing = power_of_two(-level)
         centre = self.centre * spacing
@@ -153,7 +161,7 @@ class CoveredCells:
     def sum(self, term, zero, active):
         """Σ weight · term(x, y, level, active) over all vertices (x, y) of both grids.
 
-        ``zero`` is the empty sum; ``term`` must return the same type.
+        ``zero`` is the empty sum; ``term`` must return a value of its type.
         """
         grids = self.grid(self.level, 1 - self.blend), self.grid(self.level + 1, self.blend)
         finer_columns, coarser_columns = (grid[-1] for grid in grids)
@@ -192,18 +200,18 @@ def covariance(du: mi.Vector2f, dv: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi
 
 
 def larger_eigenvalue(a: mi.Float, b: mi.Float, c: mi.Float) -> mi.Float:
-    """As the name says, for the symmetric matrix ((a, b), (b, c))."""
+    """The larger eigenvalue of the symmetric matrix ((a, b), (b, c))."""
     difference = 0.5 * (a - c)
     return 0.5 * (a + c) + dr.sqrt(dr.fma(difference, difference, b * b))
 
 
 def power_of_two(exponent: mi.Int) -> mi.Float:
-    """2^exponent, exactly; the exponent in [−126, 127]."""
+    """2^exponent, exactly, for an exponent in [−126, 127]."""
     return dr.reinterpret_array(mi.Float, mi.UInt32(exponent + 127) << 23)
 
 
 def tent_integral(x: mi.Float) -> mi.Float:
-    """∫ max(1 − |t|, 0) dt from −∞ to x, less a half; odd in x."""
+    """∫ max(1 − |t|, 0) dt from 0 to x; odd in x."""
     x = dr.clip(x, -1, 1)
     return x * (1 - 0.5 * dr.abs(x))
 
@@ -214,20 +222,20 @@ def tent_integral(x: mi.Float) -> mi.Float:
 
 
 def paraboloid_map(x: mi.Vector2f, cos_theta: mi.Float) -> mi.Vector2f:
-    """The half vector with slopes ``x`` on the plane: tan(θ/2) towards its azimuth."""
+    """The paraboloid map of the half vector with the slope ``x``: tan(θ/2) along its azimuth."""
     return x * (cos_theta / (1 + cos_theta))
 
 
 class ReflectingCount:
     """Draws the number of microdetails out of n that reflect, each with probability P(h).
 
-    It counts the less likely of both outcomes, so that P → 1 is as good as P → 0. Small
-    expectations come from the exact binomial distribution by inversion; its tail after
-    ``EXACT_TERMS`` terms comes from a truncated geometric distribution that goes on with the ratio
-    of the next two terms. All other expectations come from a Gaussian with the binomial's mean and
-    variance, plus the quadratic term of Cornish and Fisher, which gives it the binomial's skewness
-    as well. So the Gaussian may begin at ``EXACT_MEAN``, where a symmetric one would often be
-    negative. The mean is n P within 8e-4 (both errors are largest there).
+    It counts the less likely of the two outcomes, so that P → 1 is as accurate as P → 0. Counts
+    with a small expectation follow the exact binomial distribution, by inversion. After
+    ``EXACT_TERMS`` terms its tail is a truncated geometric distribution with the ratio of the next
+    two terms. All other counts follow a Gaussian with the binomial's mean and variance. The
+    quadratic term of the expansion of Cornish and Fisher gives it the binomial's skewness, too.
+    Without it, the Gaussian would often be negative for expectations near ``EXACT_MEAN``. The mean
+    is n P within 8e-4; the error is largest at ``EXACT_MEAN``.
 
     Args:
         p (mi.Float): P(h), in [0, 1].
@@ -244,30 +252,30 @@ class ReflectingCount:
     def draw(self, bits: mi.UInt32, n: mi.Float, active: mi.Bool) -> mi.Float:
         """The count for random ``bits``; ``n`` is a whole number up to 1e30."""
         u, mean = uniform(bits), n * self.p
-        few = mean <= EXACT_MEAN
-        # P(N = 0) ≥ 1 − n P: most cells hold nothing that reflects, and this saves their search
-        some = active & few & (u >= 1 - mean)
+        exact = mean <= EXACT_MEAN
+        # P(N = 0) ≥ 1 − n P: in most cells nothing reflects, and this saves their inversion
+        search = active & exact & (u >= 1 - mean)
         (count,) = dr.if_stmt(
             (mi.Float(0),),
-            active & ~few,
+            active & ~exact,
             lambda count: (self.approximate(gaussian(bits), n),),
             lambda count: (count,),
             label="many",
         )
         (count,) = dr.if_stmt(
             (count,),
-            some,
-            lambda count: (self.exact(u, n, some),),
+            search,
+            lambda count: (self.exact(u, n, search),),
             lambda count: (count,),
             label="few",
         )
         return dr.select(self.inverted, n - count, count)
 
     def exact(self, u: mi.Float, n: mi.Float, active: mi.Bool) -> mi.Float:
-        """By inversion: the number of values of the distribution function that are ≤ u."""
+        """The count by inversion: how many values of the distribution function are ≤ u."""
 
-        def more(count, probability, below):
-            # From P(N = k) and P(N ≤ k) to those of k + 1
+        def next_term(count, probability, below):
+            # From P(N = k) and P(N ≤ k) to P(N = k + 1) and P(N ≤ k + 1)
             probability = probability * dr.maximum(n - count, 0) * self.odds / (count + 1)
             return count + 1, probability, below + probability
 
@@ -275,13 +283,13 @@ class ReflectingCount:
         count, probability, below = symbolic_loop(
             (mi.Float(0), none, none + 0),
             lambda count, probability, below: active & (u >= below) & (count < EXACT_TERMS),
-            more,
+            next_term,
             "binomial",
         )
         ratio = dr.maximum(n - EXACT_TERMS, 0) * (self.odds / (EXACT_TERMS + 1))
 
         def tail(count):
-            # From here on P(N ≥ k) falls by the same ratio with every k, up to N = n
+            # From here on P(N ≥ k) falls by the same ratio from k to k + 1, up to N = n
             log_ratio = dr.log(ratio)
             left = (1 - u) / (1 - (below - probability))
             last = dr.exp(log_ratio * (n - EXACT_TERMS + 1))
@@ -296,7 +304,8 @@ class ReflectingCount:
         )[0]
 
     def approximate(self, x: mi.Float, n: mi.Float) -> mi.Float:
-        """The Gaussian number ``x`` moved, scaled, and bent to the skewness (1 − 2P)/σ."""
+        """The count from a standard normal number ``x``: its mean is n P, its skewness
+        (1 − 2P)/σ."""
         mean = n * self.p
         count = mean + dr.sqrt(mean * (1 - self.p)) * x
         count = count + (1 - 2 * self.p) / 6 * (x * x - 1)
@@ -309,12 +318,12 @@ class ReflectingCount:
 
 
 class Wheel:
-    """Fully saturated colours of all hues, twice as bright as displayable: their mean is white."""
+    """Fully saturated colours of all hues, with components up to 2, so that their mean is white."""
 
     mean = (1.0, 1.0, 1.0)
 
     def pick(self, u: mi.Float) -> mi.Color3f:
-        """The colour at the fraction ``u`` of the way around the wheel."""
+        """The colour at the fraction ``u``, in [0, 1), of the way around the wheel."""
         hue = [6 * dr.abs(u - dr.floor(u + 0.5 - k / 3) - k / 3) for k in range(3)]
         return mi.Color3f([2 * dr.clip(2 - h, 0, 1) for h in hue])
 
@@ -335,7 +344,7 @@ class Palette:
         self.colors = mi.Float(colors.ravel())
 
     def pick(self, u: mi.Float) -> mi.Color3f:
-        """The colour at the fraction ``u`` of the way through the image."""
+        """The colour at the fraction ``u``, in [0, 1), of the way through the image."""
         return dr.gather(mi.Color3f, self.colors, mi.UInt32(u * self.count))
 
     def __repr__(self) -> str:
@@ -348,14 +357,15 @@ class Palette:
 
 
 def check_ranges(values: dict[str, float], owner: str) -> None:
-    """Raise ``ParameterError`` unless all numeric parameters of :class:`Grid` are in range."""
+    """Raise :class:`~.ParameterError` unless all numeric parameters of :class:`Grid` are in
+    range."""
 
     def require(name: str, requirement: str, allowed: bool) -> None:
         check(isfinite(values[name]) and allowed, owner, name, requirement, values[name])
 
     for axis in "uv":
         alpha, detail = values[f"alpha_{axis}"], values[f"detail_alpha_{axis}"]
-        # With some room for rounding to float32
+        # A little room is for rounding to float32
         require(f"alpha_{axis}", f"a finite number ≥ {MIN_ALPHA:g}", alpha >= 0.999 * MIN_ALPHA)
         require(
             f"detail_alpha_{axis}",
@@ -373,13 +383,13 @@ def check_ranges(values: dict[str, float], owner: str) -> None:
 class Grid(PNDF):
     """P-NDF of procedural microdetails (Listing 1).
 
-    Its mean over places is exactly the Beckmann distribution of the roughness α_g. A single place
-    is not normalised: more microdetails than their share reflecting in one direction are not made
-    up for by fewer in others. Samples are drawn from the mean.
+    D(m) is the Beckmann density of the roughness α_g times a random factor of mean one: the number
+    of reflecting microdetails over its expectation. So the mean of D over all positions is exactly
+    the Beckmann distribution. At a single position D is not normalised: a surplus of microdetails
+    in one direction is not compensated by a lack in others. Samples are drawn from the mean.
 
-    D(m) is the product of the Beckmann density and of a random factor of mean one, the number of
-    reflecting microdetails over its expectation. Derivatives flow through the first: glints stay
-    where and as many as they are, and the derivative of the mean is exact.
+    Derivatives flow through the Beckmann density alone. The glints then stay in their places, and
+    the derivative of the mean is exact.
 
     It belongs to the variant of Mitsuba that is active when it is made.
 
@@ -391,14 +401,15 @@ class Grid(PNDF):
         size_variation (float): standard deviation, ≥ 0, of the number of microdetails in a cell,
             relative to its mean.
         intensity (float): factor on the result, ≥ 0.
-        light_spread (float): half angle of the light's cone, radians, in [0, π/2): half vectors
-            that lie within half of it of each other see the same microdetails.
+        light_spread (float): half angle of the light's cone, radians, in [0, π/2). Half vectors
+            within half of this angle see the same microdetails.
         colors (Wheel, Palette or None): colours of the microdetails.
         max_anisotropy (float): K_a ≥ 1, the largest aspect ratio of a pixel that is resolved.
-        seed (int): another one gives other microdetails, in [0, 2³²).
+        seed (int): seed of the microdetails, in [0, 2³²).
         owner (str): the name that errors give, usually the plugin's.
 
-    Raises :class:`~.ParameterError`.
+    Raises:
+        ParameterError: a parameter is out of range.
     """
 
     maskings = ("beckmann",)
@@ -413,7 +424,7 @@ class Grid(PNDF):
     light_spread: mi.Float
     max_anisotropy: mi.Float
 
-    #: How the cells of a footprint are chosen; benchmarks put other ways in its place.
+    #: Finds the cells that a footprint covers; benchmarks replace it with more accurate ways.
     covered_cells = CoveredCells
 
     NAMES = (
@@ -467,7 +478,7 @@ class Grid(PNDF):
         self.mean = SmoothBeckmann(lambda: self.alpha, self.roughness_keys, owner)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check parameters that have changed, and derive what depends on them."""
+        """Check parameters that have changed, and recompute what depends on them."""
         if not keys or set(keys) & set(self.NAMES):
             check_ranges({name: getattr(self, name)[0] for name in self.NAMES}, self.owner)
             self.derive()
@@ -480,7 +491,7 @@ class Grid(PNDF):
         return self.mean
 
     def masking(self, name: str = "beckmann", height_correlated: bool = False):
-        """The masking of the mean, as ``roughconductor`` has it."""
+        """The masking of the mean, the same as in Mitsuba's ``roughconductor``."""
         return super().masking(name, height_correlated)
 
     # Samples come from the mean over all places.
@@ -494,20 +505,21 @@ class Grid(PNDF):
         return self.mean.visible_pdf(wi, m, density, query, active)
 
     def derive(self) -> None:
-        """Everything that depends on the parameters alone."""
+        """Compute everything that depends on the parameters alone."""
         self.alpha = mi.Vector2f(self.alpha_u, self.alpha_v)
         with dr.suspend_grad():
             alpha_g = mi.Vector2f(self.alpha)
             alpha_l = mi.Vector2f(self.detail_alpha_u, self.detail_alpha_v)
             alpha_m = mesoscale_roughness(alpha_g, alpha_l)
-            # To a wide light a microdetail looks rougher, if not rougher than the surface
+            # Under a wide light a microdetail looks rougher, but never rougher than the surface
             apparent = dr.minimum(alpha_l + dr.tan(0.5 * self.light_spread), alpha_g)
             self.largest_p = apparent.x * apparent.y / (alpha_g.x * alpha_g.y)
-            # Cells of half vectors are as large as the lobe of a microdetail, √π α_l, which is half
-            # as much on the paraboloid map: so a microdetail reflects in about one of them. Along
-            # grooves all microdetails have one lobe in common, and there is one cell.
+            # A cell of half vectors is as large as the lobe of a microdetail, √π α_l, so that a
+            # microdetail reflects in about one cell. The paraboloid map halves lengths. Along
+            # grooves all microdetails share one lobe, and there is a single cell.
             self.cells_per_unit = 2 * alpha_m / (sqrt(pi) * apparent * alpha_g)
-            # γ_m of section 4.4: one coordinate shrinks, so that details are long where α_m is low
+            # γ_m of section 4.4: microdetails are long along the axis of the smaller α_m, as this
+            # coordinate shrinks
             larger = dr.max(alpha_m)
             self.stretch = dr.select(larger > 0, alpha_m / dr.select(larger > 0, larger, 1), 1)
             # The finest grid has one microdetail per cell
@@ -541,10 +553,10 @@ class Grid(PNDF):
         def fraction(x, y, level, active):
             x, y, name = coherent_vertex(x, y, level)
             a, b, c = pcg3d(x, y, name + self.seed)
-            # Line 12: quantise the half vector, from cell to cell at other places
+            # Line 12: quantise the half vector; the grid of half vectors is shifted in each cell
             hidx = mi.Vector2u(mi.Vector2i(dr.floor(hp + mi.Vector2f(uniform(a), uniform(b)))))
             a, b, c = pcg3d(hidx.x, hidx.y, c)
-            # Lines 14 and 16: a whole number of microdetails, of which there is always one
+            # Lines 14 and 16: a whole number of microdetails, at least one
             n = power_of_two(2 * level)
             if not is_literal_zero(self.size_variation):
                 n = dr.round(n * dr.abs(1 + self.size_variation * gaussian(a)))
@@ -553,7 +565,7 @@ class Grid(PNDF):
             count = binomial.draw(b, n, active)
             if self.colors is None:
                 return count / n
-            # N colours drawn at random add up to nearly N times their mean
+            # Section 4.5: the mean of N random colours differs from the mean colour by 1/√N
             mean = mi.Color3f(*self.colors.mean)
             color = self.colors.pick(uniform(c)) - mean
             return count / n * (mean + color * dr.rsqrt(dr.maximum(count, 1)))
