@@ -1,4 +1,4 @@
-"""Lists of things whose normals lie in ellipses: elements, flakes."""
+"""Inverted lists of items whose normals lie in ellipses, which are elements and flakes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from glintbsdf.pndf.index.lists import BlocksOfQuads, Window
 
 
 class BlocksOfEllipses(BlocksOfQuads):
-    """Quads, each bounded by ``shapes_each`` ellipses.
+    """Quads whose normals are bounded by ``shapes_each`` ellipses.
 
-    An ellipse is its centre and two conjugate radii: the points c + p cos φ + q sin φ.
+    An ellipse is given by its centre c and two conjugate radii p, q: its points are
+    c + p cos φ + q sin φ.
     """
 
     def __init__(self, lattice, ellipses, shapes_each: int) -> None:
@@ -28,11 +29,11 @@ class BlocksOfEllipses(BlocksOfQuads):
 
     @staticmethod
     def meets(ellipse, centre, half):
-        """Whether an octagon about an ellipse meets a rectangle (separating axes).
+        """Whether an octagon around an ellipse meets a rectangle, by the test of separating axes.
 
-        ``centre``, ``half`` (``mi.Vector2f``): centre and half extents of the rectangle. The
-        octagon, regular if the ellipse is round, is a twentieth larger than the ellipse. Nothing
-        cancels, however thin the ellipse.
+        ``centre``, ``half`` (``mi.Vector2f``): centre and half extents of the rectangle. The area
+        of the octagon is a twentieth larger than that of the ellipse. It is regular if the ellipse
+        is round. No digits cancel, however thin the ellipse is.
         """
         lower, upper = BlocksOfEllipses.extent(ellipse)
         meets = dr.all((lower <= centre + half) & (upper >= centre - half))

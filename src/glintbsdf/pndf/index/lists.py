@@ -1,10 +1,11 @@
-"""Point location in the manifold, inverted: for every normal, the quads that can show it.
+"""Inverted lists: for every normal, the quads of texels that can show it.
 
-The plane of projected normals is cut into cells, the lattice of texels into rows of blocks. For
-every (row of blocks, cell) there is a list of the quads of the row whose normals reach into the
-cell, from left to right, with the list's subdivision by blocks. A query has one cell; every row of
-blocks under its footprint is then one run of consecutive entries, whatever the footprint's shape.
-There is no tree and no stack, and a query visits only what is near in both position and normal.
+The plane of projected normals is divided into cells, and the lattice of texels into rows of blocks.
+For every row of blocks and every cell there is a list of the quads in the row whose normals reach
+into the cell. A list goes from left to right and is subdivided by blocks. The normal of a query
+lies in one cell. So each row of blocks under the footprint is one run of consecutive entries,
+whatever the footprint's shape. There is no tree and no stack, and a query visits only quads that
+are near in position and in normal.
 """
 
 from __future__ import annotations
@@ -23,21 +24,22 @@ from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
 
-SHIFT = BLOCK.bit_length() - 1  # quad to block
+SHIFT = BLOCK.bit_length() - 1  # index of a quad >> SHIFT is the index of its block
 
 #: Resolution per axis of the table that maps a normal to its cell.
 RESOLUTION = 1024
 
-#: Cells per axis that are tried; the finest that fits is taken.
+#: Numbers of cells per axis to try; the builder takes the largest one that the memory allows.
 DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
 
-#: Memory allowed, bytes per quad, the vertices not counted.
+#: Memory allowed to the lists, bytes per quad; the vertices are not counted.
 BYTES_PER_QUAD = 48
 
-#: Half width (in units of projected normals) by which bounds are widened against rounding.
+#: Bounds of normals are widened by this (in units of projected normals) against rounding.
 MARGIN = 1e-6
 
-#: Counters of one strip of the build: bounds what the build needs on top of its result.
+#: Number of counters in one strip of the build. It bounds the memory that the build needs besides
+#: its result.
 STRIP_COUNTERS = 1 << 23
 
 
@@ -49,8 +51,8 @@ STRIP_COUNTERS = 1 << 23
 def every_quad(lattice: Lattice, kernel, add, active, zero=None):
     """Sum over all quads that the kernel's bounding box touches; see :meth:`QuadLists.visit`.
 
-    This is the loop for footprints of a few texels, where searching costs more than it saves. The
-    sum begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
+    This loop is for footprints of a few texels, where a search costs more than it saves. The sum
+    begins with ``zero`` (default: ``mi.Float(0)``) and may be of any type that ``add`` returns.
     """
     mean = mi.Vector2f(kernel.mean)
     left, top = floor_int(mean.x - kernel.reach_u), floor_int(mean.y - kernel.reach_v)
@@ -80,21 +82,21 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
     """Sum over the entries of the lists that the kernel touches; see :meth:`QuadLists.visit`.
 
     The lattice's blocks have the side ``1 << shift``, a number or one per lane (``mi.Int``).
-    ``run_of(row of blocks, first block, last block, active)`` returns begin and end of a run of
-    consecutive entries, ``place_of(entry, first row of the row of blocks, active)`` the row and
-    column that an entry stands for, and whatever else ``add`` is to be given. The sum begins with
+    ``run_of(row of blocks, first block, last block, active)`` returns the begin and the end of a
+    run of consecutive entries. ``place_of(entry, first row of the row of blocks, active)`` returns
+    the row and the column of an entry, and any further arguments of ``add``. The sum begins with
     ``zero``, as in :func:`every_quad`.
 
-    One loop goes over the runs, and one in it over a run's entries. No lane leaves a flat loop
-    before all are done: in it nearly every step is the first of a run to some of the lanes, and all
-    wait while it is found. It is cheaper to wait at the end of the runs.
+    An outer loop goes over the runs, an inner one over the entries of a run. A single flat loop
+    would be slower: in nearly every step, some lane would begin a new run, and all others would
+    wait while it is found. It is cheaper to wait once at the end of each run.
     """
     columns, rows = lattice.x, lattice.y
     mean = mi.Vector2f(kernel.mean)
     bottom = floor_int(mean.y + kernel.reach_v)
 
     def body(x, right, next_y, origin_y, row, active, density):
-        # The next row of blocks where this one is done, and its extent under the kernel.
+        # Where this row of blocks is done, go to the next one and find its extent under the kernel.
         new_row = x > right
         active = active & ~(new_row & (next_y > bottom))
         origin, y, row_end = rows.locate(next_y)
@@ -113,7 +115,7 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
                 (first_row, row),
             )
         )
-        # Its next run: as far as blocks are stored side by side.
+        # The row's next run goes as far as blocks are stored side by side.
         origin_x, column, column_end = columns.locate(x)
         last = dr.minimum(right - origin_x, column_end - 1) >> shift
         entry, end = run_of(
@@ -140,7 +142,7 @@ def walk(lattice: Lattice, shift, kernel, run_of, place_of, add, active, zero=No
 
 
 class Packed:
-    """An array of unsigned integers; it packs two to a word where 16 bits are enough."""
+    """An array of unsigned integers on the device. Two share a word where 16 bits are enough."""
 
     def __init__(self, values: np.ndarray) -> None:
         self.half = values.dtype == np.uint16
@@ -150,7 +152,7 @@ class Packed:
         self.nbytes = values.nbytes
 
     def __getitem__(self, item):
-        """Gather, ``item`` = (index, active)."""
+        """Gather values; ``item`` is the pair (index, active)."""
         index, active = item
         if not self.half:
             return dr.gather(mi.UInt32, self.words, index, active)
@@ -161,18 +163,20 @@ class Packed:
 class NormalCells:
     """Division of a rectangle of projected normals into S×S cells.
 
-    There are S slabs along x, each cut into S cells along y. The cuts are half uniform, half
-    quantiles of the map's normals: cells are small where normals, hence queries, are many.
+    There are S slabs along x, and each slab is divided into S cells along y. A cut is the mean of a
+    uniform division and a quantile of the map's normals. So cells are small where normals, and
+    queries with them, are frequent.
     """
 
     divisions: int | mi.UInt32
 
     def __init__(self, lower, upper, slab_of_x: np.ndarray, cell_of_y: np.ndarray) -> None:
-        """``slab_of_x`` (RESOLUTION), ``cell_of_y`` (S, RESOLUTION): tables over the rectangle."""
+        """``slab_of_x`` (RESOLUTION) and ``cell_of_y`` (S, RESOLUTION) are tables over the
+        rectangle from ``lower`` to ``upper``."""
         self.lower, self.upper = (np.asarray(v, np.float32) for v in (lower, upper))
         self.divisions = len(cell_of_y)
         self.scale = (RESOLUTION / (self.upper - self.lower)).astype(np.float32)
-        # For kernels, which are the same for all maps.
+        # Opaque values: one kernel serves all maps.
         self.origin, self.pixels = (
             [dr.opaque(mi.Float, float(x)) for x in values] for values in (self.lower, self.scale)
         )
@@ -182,7 +186,7 @@ class NormalCells:
 
     @staticmethod
     def histogram(normals: np.ndarray, lower, upper) -> np.ndarray:
-        """Number of normals (N, 2) per pixel of the tables, by x and y."""
+        """Number of ``normals`` (N, 2) in each pixel of the tables: an array over x and y."""
         pixel = ((normals - lower) * (RESOLUTION / (upper - lower))).astype(np.int64)
         x, y = np.clip(pixel, 0, RESOLUTION - 1).T
         counts = np.bincount(x * RESOLUTION + y, minlength=RESOLUTION**2)
@@ -213,10 +217,12 @@ class NormalCells:
         return (x >= 0) & (x < RESOLUTION) & (y >= 0) & (y < RESOLUTION)
 
     def slab(self, x, active=True):
+        """Index of the slab of the coordinate ``x``."""
         index = mi.UInt32(dr.clip(self.pixel(x, 0), 0, RESOLUTION - 1))
         return dr.gather(mi.UInt32, self.slab_of_x, index, active)
 
     def cell_in_slab(self, slab, y, active=True):
+        """Index, within a slab, of the cell of the coordinate ``y``."""
         index = mi.UInt32(dr.clip(self.pixel(y, 1), 0, RESOLUTION - 1))
         return dr.gather(mi.UInt32, self.cell_of_y, slab * RESOLUTION + index, active)
 
@@ -226,7 +232,7 @@ class NormalCells:
         return slab * self.count + self.cell_in_slab(slab, m.y, active)
 
     def edges(self) -> tuple[mi.Float, mi.Float]:
-        """Lower edges of the slabs (S + 1), and of the cells of each slab (S, S + 1), flat."""
+        """Edges of the slabs (S + 1), and edges of the cells of each slab (S·(S + 1))."""
         wanted = np.arange(self.divisions + 1)
         slabs = np.searchsorted(self.slab_of_x.numpy(), wanted)
         cells = [
@@ -239,21 +245,21 @@ class NormalCells:
 
 
 class Span(NamedTuple):
-    """Blocks along one axis: ``size`` from ``first`` on; block 0 follows the last of ``all``."""
+    """``size`` blocks from the block ``first`` on, of ``all`` blocks along a periodic axis."""
 
     first: int
     size: int
     all: int
 
     def place(self, block):
-        """Which of the span a block is (``mi.UInt32``)."""
+        """Index within the span of a block (``mi.UInt32``)."""
         if self.size == self.all and self.first == 0:
             return block
         first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
         return dr.select(block < first, block + all, block) - first
 
     def block(self, place):
-        """The block at a place of the span (``mi.UInt32``)."""
+        """The block (``mi.UInt32``) at an index within the span."""
         if self.size == self.all and self.first == 0:
             return place
         first, all = (dr.opaque(mi.UInt32, x) for x in (self.first, self.all))
@@ -281,15 +287,19 @@ class Window(NamedTuple):
 
 
 class QuadLists:
-    """The lists, made of the arrays that :meth:`build` returns.
+    """The lists, on the device.
 
-    ``window``: the blocks that have lists, all by default. Queries must not touch any other.
+    Args:
+        lattice (Lattice): the lattice of quads.
+        arrays (dict): the arrays that :meth:`build` returns; they are taken out of it.
+        window (Window): the blocks that have lists, by default all. Queries must touch no others.
 
-    Arrays (NumPy), with R rows of blocks, B blocks in a row, C cells:
-        ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
-        ``entries``: quads as ``column << SHIFT | row in block``;
-        ``start`` (R·C): first entry of each list; ``offset`` (R·C·(B + 1)): first entry of each
-        block, counted from the list's first.
+    The arrays (NumPy), with R rows of blocks, B blocks in a row, and C cells, are
+
+    * ``lower``, ``upper``, ``slab_of_x``, ``cell_of_y``: the cells, see :class:`NormalCells`;
+    * ``entries``: the quads, as ``column << SHIFT | row in block``;
+    * ``start`` (R·C): index of the first entry of each list;
+    * ``offset`` (R·C·(B + 1)): first entry of each block, counted from the start of its list.
     """
 
     def __init__(
@@ -299,21 +309,21 @@ class QuadLists:
         self.cells = NormalCells(
             arrays["lower"], arrays["upper"], arrays["slab_of_x"], arrays["cell_of_y"]
         )
-        # Taken out one by one, so that a large map never has more than one array twice.
+        # Taken out one by one: a large map then never has two copies of more than one array.
         self.entries, self.offset = Packed(arrays.pop("entries")), Packed(arrays.pop("offset"))
         self.start = mi.UInt32(arrays.pop("start"))
         self.nbytes = self.entries.nbytes + self.offset.nbytes + 4 * dr.width(self.start)
 
     def covers(self, m):
-        """Whether any quad may show the normal ``m``."""
+        """Whether ``m`` is within the bounds of the lists: elsewhere no quad shows it."""
         return self.cells.covers(m)
 
     def visit(self, m, kernel, add, active, zero=None) -> mi.Float:
-        """Sum over all quads that may show ``m`` under the kernel, beginning with ``zero``.
+        """Sum over all quads that may show ``m`` under the kernel; the sum begins with ``zero``.
 
-        Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice,
-        ``corner`` (``mi.Vector2f``) being the quad's position from the kernel's centre, in texels;
-        it returns the new ``density``. Sums are differentiable in both modes.
+        Calls ``add(density, row, column, corner, active)`` for stored quads of the lattice. It
+        returns the new ``density``. ``corner`` (``mi.Vector2f``) is the quad's position relative to
+        the kernel's centre, in texels. Sums are differentiable in both modes.
         """
         rows, columns = self.window
         count, width = dr.square(self.cells.count), dr.opaque(mi.UInt32, columns.size + 1)
@@ -346,11 +356,15 @@ class QuadLists:
         window: Window | None = None,
         bytes_per_quad: float = BYTES_PER_QUAD,
     ) -> dict[str, np.ndarray]:
-        """Build the arrays, in two passes over the lattice, or a window of it: count, then fill.
+        """Build the arrays of a window of the lattice, in two passes: one counts, one fills.
 
-        ``triangles(row, column, active)`` returns the triangles of a stored quad, each as a vertex
-        and two edges (``mi.Vector2f``); ``normals`` (N, 2) are the map's; ``bounds`` (lower, upper)
-        is a rectangle inside which all triangles lie; ``bytes_per_quad`` is the memory allowed.
+        Args:
+            triangles: function ``(row, column, active)`` that returns the triangles of a stored
+                quad, each as a vertex and two edges (``mi.Vector2f``).
+            normals: projected normals of the map, (N, 2).
+            bounds: rectangle (lower, upper) of projected normals that holds all triangles.
+            window: the blocks to make lists for, by default all.
+            bytes_per_quad: memory allowed.
         """
         window = window or Window.whole(lattice)
         blocks = BlocksOfQuads(lattice, triangles, window)
@@ -358,15 +372,15 @@ class QuadLists:
 
 
 class Blocks:
-    """What :class:`Builder` makes lists of: things in blocks, whose normals lie in a few shapes.
+    """The input of :class:`Builder`: items in blocks, each with a few shapes that hold its normals.
 
-    A shape is three ``mi.Vector2f``; here it is a triangle, a vertex and two edges.
+    A shape is three ``mi.Vector2f``. In this class it is a triangle: a vertex and two edges.
 
     Attributes:
         rows, columns (int): number of blocks along each axis.
-        mean_count (float): things in a block, on average.
+        mean_count (float): mean number of items in a block.
         largest_entry (int): the largest entry that the lists may hold.
-        shapes_each (int): number of shapes of a thing.
+        shapes_each (int): number of shapes of an item.
     """
 
     shapes_each = 2
@@ -387,7 +401,7 @@ class Blocks:
         lower, upper = Blocks.extent((a, e1, e2))
         meets = dr.all((lower <= half) & (upper >= -half))
         for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
-            normal = mi.Vector2f(-edge.y, edge.x)  # a separating axis, if there is one
+            normal = mi.Vector2f(-edge.y, edge.x)  # a candidate for a separating axis
             radius = dr.dot(dr.abs(normal), half)
             p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
             meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
@@ -405,11 +419,11 @@ class BlocksOfQuads(Blocks):
         self.mean_count, self.largest_entry = float(BLOCK**2), lattice.x.quads * BLOCK
 
     def count(self, block_row, block_column):
-        """How many quads a block has."""
+        """Number of quads in a block."""
         return BLOCK**2
 
     def shapes(self, block_row, block_column, quad, active):
-        """Whether the ``quad``-th of a block exists, and its shapes."""
+        """Whether the quad with the index ``quad`` in a block exists, and its shapes."""
         row = self.window.rows.block(block_row) * BLOCK + (quad >> SHIFT)
         column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
         exists = active & (mi.Int(row) < self.lattice.y.count)
@@ -417,16 +431,22 @@ class BlocksOfQuads(Blocks):
         return exists, self.shapes_of_quad(row, column, exists)
 
     def entry(self, block_row, block_column, quad):
-        """What the lists say of the ``quad``-th of a block."""
+        """The entry that stands in the lists for the quad with the index ``quad`` in a block."""
         column = self.window.columns.block(block_column) * BLOCK + (quad & (BLOCK - 1))
         return (column << SHIFT) | (quad >> SHIFT)
 
 
 class Builder:
-    """Scans all quads against all cells that they reach, one lane per block of quads.
+    """Builds the lists: it tests all quads against all cells in reach, one lane per block of quads.
 
-    A lane alone touches the counters of its block, so the order of the entries, and with it every
-    later sum, is the same on all machines.
+    Only one lane touches the counters of a block. So the order of the entries, and of every later
+    sum, is the same on all machines.
+
+    Args:
+        blocks (Blocks): the items.
+        normals: projected normals of the map, (N, 2), by which cells are placed.
+        bounds: rectangle (lower, upper) of projected normals that holds all shapes.
+        bytes_per_quad (float): memory allowed to the lists, per item.
     """
 
     def __init__(self, blocks, normals, bounds, bytes_per_quad: float = BYTES_PER_QUAD) -> None:
@@ -436,6 +456,7 @@ class Builder:
         self.rows, self.columns = blocks.rows, blocks.columns
 
     def arrays(self) -> dict[str, np.ndarray]:
+        """Build the arrays of :class:`QuadLists`."""
         divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= self.allowed)
         tables = self.use(divisions)
         cells = divisions**2
@@ -474,14 +495,14 @@ class Builder:
         }
 
     def use(self, divisions: int):
-        """Divide the normals into ``divisions``² cells; returns the tables."""
+        """Divide the normals into ``divisions``² cells, and return the tables of the cells."""
         tables = NormalCells.tables(self.histogram, divisions)
         self.cells = NormalCells(self.lower, self.upper, *tables)
         self.slab_edges, self.cell_edges = self.cells.edges()
         return tables
 
     def bytes_per_quad(self, divisions: int) -> float:
-        """Memory of the lists with so many divisions, estimated from a sample of blocks."""
+        """Memory of the lists with this many divisions, estimated from a sample of blocks."""
         self.use(divisions)
         sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
         row, column = (
@@ -496,8 +517,9 @@ class Builder:
     def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
         """Scan the rows of blocks of a strip.
 
-        ``counters`` (rows, cells, columns + 1) count the quads per list and block. With
-        ``entries``, their number, they say where the next one goes, and the entries are returned.
+        Without ``entries``, ``counters`` (rows, cells, columns + 1) count the quads of each list
+        and block, and are returned. With ``entries``, the total number of entries, each counter is
+        the index of the next entry of its list and block, and the filled entries are returned.
         """
         shape = counters.shape
         block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
@@ -519,7 +541,7 @@ class Builder:
         return filled.numpy()[:entries]
 
     def scan(self, block_row, block_column, counter_of_cell, counters, entries=None) -> None:
-        """For all quads of the given blocks, count or enter them in the cells that they reach."""
+        """Count the quads of the given blocks in all cells that they reach, or enter them there."""
         cells, blocks = self.cells, self.blocks
         count = blocks.count(block_row, block_column)
 

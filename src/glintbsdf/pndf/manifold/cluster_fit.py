@@ -1,16 +1,16 @@
-"""Clusters of the position-normal manifold: their normals and how far they are from the map's.
+"""Clusters of the position-normal manifold: their normals, and their distance from the map.
 
 Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
-High-Resolution Normal Maps" (2024), section 4.2, Eq. 7 and 8. A cluster of level l takes the place
-of 2^l × 2^l quads by two triangles, whose vertex normals n_0^l…n_3^l are the least-squares fit
+High-Resolution Normal Maps" (2024), section 4.2, Eq. 7 and 8. A cluster of level l replaces
+2^l × 2^l quads by two triangles, whose vertex normals n_0^l…n_3^l are the least-squares fit
 
     argmin ∫ ‖n^l(u/2^l) − n(u)‖² / |det J(u)| du.                                       (Eq. 7)
 
-Over a triangle of the map the integrand is a quadratic polynomial, and the diagonals of clusters
-and quads align, so that every triangle of the map lies in one half of the cluster. Its integral is
-thus exact by the rule of the three midpoints of edges, and a cluster needs only the moments, up to
-the second, of the map over its two halves. A parent's moments are sums of its children's, so that
-all levels together cost little more than the first. All is NumPy in float64, without Dr.Jit.
+The diagonals of clusters and quads align, so every triangle of the map lies in one half of a
+cluster. Over this triangle the integrand is a quadratic polynomial, and the values at the midpoints
+of its edges give the exact integral. So a cluster needs only the moments, up to the second, of the
+map over its two halves. The moments of a parent are sums of moments of its children, so that all
+levels together cost little more than the first. Everything is NumPy in float64, without Dr.Jit.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-#: Quads in a strip whose moments are held at once; each takes 208 bytes.
+#: Number of quads in a strip, whose moments are in memory at the same time; each takes 208 bytes.
 STRIP_QUADS = 1 << 18
 
-#: Added to the diagonal of A, relative to its mean, against singular systems. The true A has none:
-#: every triangle has a weight > 0; but weights may differ by more than float64 can tell.
+#: Added to the diagonal of A, relative to its mean, against singular systems. The true A is
+#: regular, as every triangle has a weight > 0. But weights may differ by more than float64
+#: resolves.
 RIDGE = 1e-12
 
 #: Moments of one half of a cluster, weighted by 1/|det J|, about its corner n_0 and in units of its
 #: side: of 1, x, y, x², xy, y²; of n_x, n_y times 1, x and y each; of ‖n‖². All per texel².
 MOMENTS = 6 + 3 * 2 + 1
 
-#: Where the products of 1, x, y with one another stand among the moments.
+#: Indices, among the moments, of the products of 1, x, y with 1, x, y.
 PRODUCTS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 #: Barycentric weights φ of n_0^l…n_3^l over the upper and the lower half, in terms of 1, x, y.
@@ -52,17 +53,16 @@ def fit_clusters(
     """Fit the clusters of the levels l = 1…``levels``, one level after the other.
 
     ``vertices`` (R + 1, C + 1, 2) are the projected normals at the corners of R×C quads;
-    ``epsilon`` is the least |det J|. Yields, for every level, arrays over its ⌊R/2^l⌋ × ⌊C/2^l⌋
+    ``epsilon`` is the smallest |det J|. Yields, for every level, arrays over its ⌊R/2^l⌋ × ⌊C/2^l⌋
     whole clusters: the normals n_0^l…n_3^l, (…, 4, 2), and the residuals e^l.
 
-    The residual of the solved normal equations, which Eq. 8 prints, is 0 but for rounding. What is
-    returned is the integral that Eq. 7 minimises, at its minimum, in texels⁴: |det J| being the
-    area of normals per texel, ‖n^l − n‖²/|det J| is, to first order, the squared distance (texels²)
-    between the places at which the cluster and the map show a normal, and the integral runs over
-    the cluster's texels.
+    Eq. 8 prints the residual of the solved normal equations, which is 0 but for rounding. The
+    residual that is returned is the minimum of the integral in Eq. 7, in texels⁴. Its integrand
+    ‖n^l − n‖²/|det J| is, to first order, the squared distance (texels²) between the positions at
+    which the cluster and the map show the same normal.
     """
     vertices = np.asarray(vertices, np.float64)
-    mean = vertices.mean((0, 1))  # taken out, so that ‖n‖² has digits left for the residual
+    mean = vertices.mean((0, 1))  # subtracted, so that ‖n‖² has digits left for the residual
     moments = first_moments(vertices - mean, epsilon)
     for level in range(1, levels + 1):
         if level > 1:
@@ -89,10 +89,10 @@ def quad_moments(vertices: Array, epsilon: float) -> Array:
     n2, n3 = planes[:, 1:, :-1], planes[:, 1:, 1:]
     moments = np.empty((MOMENTS, 2, *n0.shape[1:]))
     for half, (a, b, c) in enumerate(((n0, n1, n2), (n3, n2, n1))):
-        # The midpoints of the edges stand at (½, 0), (½, ½) and (0, ½) in the frame of a, b, c.
+        # The midpoints of the edges are (½, 0), (½, ½) and (0, ½) in the frame of a, b, c.
         ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
         det = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        weight = (0.5 / 3) / np.maximum(np.abs(det), epsilon)  # a third of the area, for each
+        weight = (0.5 / 3) / np.maximum(np.abs(det), epsilon)  # a third of the area per midpoint
         for k, factor in enumerate((3, 1, 1, 0.5, 0.25, 0.5)):
             np.multiply(weight, factor, out=moments[k, half])
         for axis in range(2):
@@ -105,9 +105,9 @@ def quad_moments(vertices: Array, epsilon: float) -> Array:
 
 
 def transformed(first: Array) -> Array:
-    """Matrix (MOMENTS, MOMENTS) from moments in one frame to those in another.
+    """Matrix (MOMENTS, MOMENTS) that takes moments from a source frame to a target frame.
 
-    ``first`` (3, 3) gives 1, x, y of the other frame in terms of those of the one.
+    ``first`` (3, 3) expresses 1, x, y of the target frame by 1, x, y of the source frame.
     """
     matrix = np.zeros((MOMENTS, MOMENTS))
     for i, j in zip(*np.triu_indices(3), strict=True):
@@ -117,7 +117,7 @@ def transformed(first: Array) -> Array:
     return matrix
 
 
-#: From the frame of n_3, n_2, n_1 to that of the quad.
+#: Transforms moments from the frame of n_3, n_2, n_1 to the frame of the quad.
 TURNED = transformed(np.array([[1.0, 0, 0], [1, -1, 0], [1, 0, -1]]))
 
 
@@ -129,7 +129,7 @@ def merged(moments: Array) -> Array:
         seen = transformed(np.array([[1, 0, 0], [x / 2, 0.5, 0], [y / 2, 0, 0.5]]))
         return np.tensordot(seen, moments[..., y : 2 * rows : 2, x : 2 * columns : 2], 1)
 
-    # The parent's diagonal runs along those of its right upper and its left lower child.
+    # The parent's diagonal is made of the diagonals of its upper right and its lower left child.
     halves = child(1, 0) + child(0, 1)
     halves[:, 0] += child(0, 0).sum(1)
     halves[:, 1] += child(1, 1).sum(1)
@@ -147,7 +147,7 @@ def solve(moments: Array) -> tuple[Array, Array]:
     b = np.einsum("hip,...hap->...ia", PHI, first, optimize=True)
     square = moments[..., -1].sum(-1)
 
-    # About the cluster's mean normal; the weights of n_0…n_3 sum to 1 everywhere.
+    # Relative to the cluster's mean normal; the weights of n_0…n_3 sum to 1 everywhere.
     mass = moments[..., 0].sum(-1)[..., None]
     mean = first[..., 0].sum(-2) / mass
     b -= A.sum(-1)[..., None] * mean[..., None, :]

@@ -1,7 +1,7 @@
 """Diffuse reflection of the facets under a footprint.
 
-Each class gives ``f cosθ_o`` of a white surface, 1/steradian. Directions are unit vectors of the
-upper hemisphere, in the local shading frame.
+Both classes compute ``f cosθ_o`` of a white surface, per steradian. Directions are unit vectors of
+the upper hemisphere, in the local shading frame.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from glintbsdf.pndf.manifold.projected_area import ProjectedArea
 
 
 class FacetDiffuse:
-    """All facets under the footprint, each diffuse: f_d = P(ω) / (π ω_z), ω towards the light.
+    """All facets under the footprint, each diffuse: f_d = P(ω) / (π ω_z), with ω to the light.
 
     Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
-    High-Resolution Normal Maps" (2024), section 4.3, Eq. 14. The facets count with their own area,
-    1/m_z that of the surface, and neither hide nor light each other: what they reflect of uniform
-    light is the mean of (1 + 1/m_z)/2, which is above 1 by the mean squared slope over 4.
+    High-Resolution Normal Maps" (2024), section 4.3, Eq. 14. A facet counts with its own area,
+    which is 1/m_z times its area on the surface. Facets neither hide nor light each other. So the
+    share of uniform light that they reflect is the mean of (1 + 1/m_z)/2, which exceeds 1 by a
+    quarter of the mean squared slope.
 
     Args:
         mesh (TexelMesh): the manifold.
@@ -50,8 +51,8 @@ class FacetDiffuse:
     ) -> mi.Float:
         """``f_d cosθ_o``. The light is at ``wo``, or at ``wi`` where importance is transported.
 
-        ``frame``: how slopes of a height map lie on the surface. Facets seen from ω are those that
-        its ω′ sees in the map, and P(ω)/ω_z = P′(ω′)/ω′_z.
+        ``frame``: the frame of a height map's slopes on the surface. The direction ω in the shading
+        frame is ω′ in the map, and P(ω)/ω_z = P′(ω′)/ω′_z.
         """
         if frame is not None:
             seen_i, seen_o = frame.direction_to_map(wi), frame.direction_to_map(wo)
@@ -72,14 +73,14 @@ class FacetDiffuse:
 class OrenNayarDiffuse:
     """The filtered surface: Oren and Nayar's model around the mean normal of the footprint.
 
-    Wu24, appendix C: the mean of the projected normals gives the frame, the variance of the slopes
-    the roughness, as in LEADR mapping (Dupuy et al. 2013), with σ² half the trace of the slopes'
-    covariance. The model is the "qualitative" one of Oren and Nayar, "Generalization of Lambert's
-    Reflectance Model", SIGGRAPH 1994, without interreflection.
+    Wu24, appendix C: the frame is that of the mean projected normal, and the roughness follows from
+    the variance of slopes, as in LEADR mapping (Dupuy et al. 2013). σ² is half the trace of the
+    slopes' covariance. The model is the "qualitative" one of Oren and Nayar, "Generalization of
+    Lambert's Reflectance Model", SIGGRAPH 1994, without interreflection.
 
     Args:
-        mesh (TexelMesh): gives the normals; its triangles play no part.
-        domain (Domain): what will be asked for, see ``MomentPyramid``.
+        mesh (TexelMesh): holds the normals; its triangles are not used.
+        domain (Domain): the queries to expect, see :class:`~.MomentPyramid`.
     """
 
     def __init__(self, mesh: TexelMesh, domain: Domain | None = None) -> None:
@@ -91,7 +92,7 @@ class OrenNayarDiffuse:
         return {f"MIP levels {self.pyramid.first} to {self.pyramid.top}": self.pyramid.nbytes}
 
     def parameters_changed(self) -> None:
-        """Average anew the data of the mesh."""
+        """Recompute the averages from the data of the mesh."""
         self.pyramid = MomentPyramid(
             self.mesh.data,
             self.mesh.normal_map.wrap_mode,
@@ -110,11 +111,11 @@ class OrenNayarDiffuse:
     ) -> mi.Float:
         """``f cosθ_o``; zero where either direction is below the mean facet.
 
-        The model is reciprocal about the mean normal, but cosθ_o is that to the surface, as inside
-        ``normalmap``: where importance is transported, directions change places.
+        The model is reciprocal about the mean normal, but cosθ_o is relative to the surface, as in
+        Mitsuba's ``normalmap``. So the two directions are swapped where importance is transported.
 
-        ``frame``: how slopes of a height map lie on the surface. Their variance is taken to be the
-        same in all directions of the map.
+        ``frame``: the frame of a height map's slopes on the surface. The variance of slopes counts
+        as the same in all directions of the map.
         """
         x, y, slope_x, slope_y, squared = self.pyramid.average(query)
         variance = 0.5 * dr.maximum(squared - slope_x * slope_x - slope_y * slope_y, 0)
@@ -142,13 +143,13 @@ def slope_moments(m: mi.Vector2f) -> list:
 def oren_nayar(wi: mi.Vector3f, wo: mi.Vector3f, variance: mi.Float) -> mi.Float:
     """``f cosθ_o`` of a white rough surface (Oren and Nayar 1994).
 
-    ``variance``: σ², that of the facets' inclination, radians².
+    ``variance``: σ², the variance of the facets' inclination, radians².
     """
     active = (wi.z > 0) & (wo.z > 0)
     a = 1 - 0.5 * variance / (variance + 0.33)
     b = 0.45 * variance / (variance + 0.09)
-    # cos(φ_i − φ_o) sin α tan β, with sinθ_i sinθ_o cos(φ_i − φ_o) the product of the projections:
-    # the larger angle has the smaller cosine.
+    # cos(φ_i − φ_o) sin α tan β, with α the larger and β the smaller angle. The product of the
+    # projections is sinθ_i sinθ_o cos(φ_i − φ_o), and the smaller angle has the larger cosine.
     product = dr.fma(wi.x, wo.x, wi.y * wo.y)
     across = dr.maximum(product, 0) / dr.select(active, dr.maximum(wi.z, wo.z), 1)
     return dr.select(active, (a + b * across) * wo.z / pi, 0)

@@ -1,8 +1,8 @@
-"""The P-NDF of the position-normal manifold, exact.
+"""The exact P-NDF of the position-normal manifold.
 
 Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
-High-Resolution Normal Maps" (2024), section 4.1: Eq. 5 summed over all triangles under the
-footprint, which inverted lists find, and the sampler of Eq. 6.
+High-Resolution Normal Maps" (2024), section 4.1. Evaluation sums Eq. 5 over all triangles under the
+footprint, which inverted lists find. Sampling is Eq. 6.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from glintbsdf.pndf.manifold import projected_area
 from glintbsdf.pndf.manifold.mesh import TexelMesh, equilateral, quad_density
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
-#: Roughness σ_r of the elements that stand in for the manifold while derivatives of the map are
-#: asked for: as a share of the standard deviation of the map's normals, and at least.
+#: Roughness σ_r of the elements that replace the manifold while the map carries derivatives. It is
+#: ROUGHNESS times the standard deviation of the map's normals, and at least MIN_ROUGHNESS.
 ROUGHNESS, MIN_ROUGHNESS = 0.1, 1e-3
 
 
@@ -37,18 +37,19 @@ ROUGHNESS, MIN_ROUGHNESS = 0.1, 1e-3
 class Manifold(TexelMesh, PNDF):
     """Exact P-NDF of a normal map (Eq. 5) and its exact sampler (Eq. 6).
 
-    Arguments, attributes and errors are those of :class:`~.TexelMesh`.
+    Other arguments, attributes and errors are the same as in :class:`~.TexelMesh`.
 
     Args:
-        domain (Domain): what will be asked; None for anything. Lists are then made of the part of
-            the map that it touches, or none where all footprints are summed quad by quad.
+        domain (Domain): the queries to expect; None for any. Lists are made for the part of the map
+            that these touch, and not at all where all footprints are summed quad by quad.
             Evaluation within the domain is the same to the last bit.
 
-    As a function of the map, D at a fixed m jumps wherever an edge of a triangle crosses m. It has
-    a derivative as a distribution only, ``∂D/∂θ = −div_m ∫ k δ(m − n(u)) ∂n/∂θ du``. So as long as
-    the ``data`` carry derivatives, an :class:`~.Elements` mixture of the same map stands in, of the
-    little roughness :data:`ROUGHNESS`, in evaluation as in sampling. It is smooth, and its elements
-    follow the same triangles: averages over more than this roughness have the same derivatives.
+    As a function of the map, D at a fixed m jumps wherever an edge of a triangle crosses m. So its
+    derivative is only a distribution, ``∂D/∂θ = −div_m ∫ k δ(m − n(u)) ∂n/∂θ du``. While the
+    ``data`` carry derivatives, a mixture of :class:`~.Elements` of the same map replaces the
+    manifold, in evaluation and in sampling. Its roughness is small, see :data:`ROUGHNESS`. The
+    mixture is smooth, and its elements follow the same triangles. Averages of D over more than this
+    roughness have the same derivatives as averages of the mixture.
     """
 
     normal_map: NormalMap
@@ -69,7 +70,7 @@ class Manifold(TexelMesh, PNDF):
         self.build(domain)
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make the lists of what queries within ``domain`` need; the cache may know them."""
+        """Build the lists for queries within ``domain``, or load them from the cache."""
         self.domain = domain
         self.lists, self.area, self.stand_in = None, None, None
         if dr.grad_enabled(self.data):
@@ -98,7 +99,7 @@ class Manifold(TexelMesh, PNDF):
         self.lists = QuadLists(self.lattice, arrays, window)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check new data, and rebuild. Derivatives keep flowing to them."""
+        """Check new data, and rebuild. Derivatives keep flowing to the data."""
         if keys and "data" not in keys:
             return
         self.changed = True
@@ -121,7 +122,7 @@ class Manifold(TexelMesh, PNDF):
                     "params.update() makes; it must be called after dr.enable_grad()"
                 )
             return super().eval(m, query, active)
-        return self.stand_in.eval(m, self.asked_of_stand_in(query), active)
+        return self.stand_in.eval(m, self.query_of_stand_in(query), active)
 
     def sample(
         self,
@@ -132,10 +133,10 @@ class Manifold(TexelMesh, PNDF):
     ) -> mi.Vector2f:
         if self.stand_in is None:
             return super().sample(query, sample1, sample2, active)
-        return self.stand_in.sample(self.asked_of_stand_in(query), sample1, sample2, active)
+        return self.stand_in.sample(self.query_of_stand_in(query), sample1, sample2, active)
 
-    def asked_of_stand_in(self, question: Query | Footprint) -> Query:
-        """The query of the Gaussian footprint that has the variance of this kernel's."""
+    def query_of_stand_in(self, question: Query | Footprint) -> Query:
+        """The query with a narrower footprint: the Gaussian with the variance of this kernel."""
         query, width = Query.of(question), sqrt(VARIANCE[self.kernel])
 
         def narrowed() -> Query:
@@ -150,25 +151,25 @@ class Manifold(TexelMesh, PNDF):
         active = active & (dr.squared_norm(m) < 1)
         if self.lists is not None:
             active &= self.lists.covers(m)
-        few = kernel.touched_quads() <= tuning().few_quads
+        small = kernel.touched_quads() <= tuning().few_quads
 
         def add(density, row, column, corner, active):
             normals = self.quad_normals(row, column, active)
             added = quad_density(m, corner, kernel, normals, self.epsilon, active)
             return density + dr.select(active, added, 0)
 
-        # In the other order, the lists take a tenth longer on LLVM, even where no footprint is few.
+        # The lists come first: in the other order they are slower on LLVM.
         density = mi.Float(0)
         if self.lists is not None:
-            density = self.lists.visit(m, kernel, add, active & ~few)
-        return density + every_quad(self.lattice, kernel, add, active & few)
+            density = self.lists.visit(m, kernel, add, active & ~small)
+        return density + every_quad(self.lattice, kernel, add, active & small)
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """Draw a projected normal with density D (Eq. 6): the normal at a place drawn from k.
+        """Draw a projected normal with density D (Eq. 6): the normal at a position drawn from k.
 
-        ``sample1`` is not needed.
+        ``sample1`` is not used.
         """
         kernel = self.texel_kernel(query)
         return self.normal_at(kernel.mean + kernel.sample(sample2), active)
@@ -177,15 +178,16 @@ class Manifold(TexelMesh, PNDF):
         return SmoothBeckmann(lambda: smooth_alpha(self.alpha_squared()), owner=self.owner)
 
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
-        """``ggx_fit`` and ``analytic``: that of the facets under the footprint over their mean
-        plane, by either estimate of their projected area."""
+        """``ggx_fit`` and ``analytic`` are the masking of the facets under the footprint, over
+        their mean plane; they differ in the estimate of the projected area."""
         area = projected_area.area(name, self, self.domain)
         if area is None:
             return super().masking(name, height_correlated)
         return projected_area.ProjectedAreaMasking(area, height_correlated)
 
     def projected_areas(self, directions, query, active):
-        """Those of the triangles. The first call must not be part of a recording."""
+        """The projected areas of the triangles, by :class:`~.ProjectedArea`. The first call must
+        not be part of a recorded loop."""
         if self.area is None:
             self.area = projected_area.ProjectedArea(self)
         return self.area.projected_areas(directions, query, active)

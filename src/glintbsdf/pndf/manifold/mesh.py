@@ -1,9 +1,10 @@
-"""The position-normal manifold: its triangles, and what one quad of them adds to the P-NDF.
+"""The position-normal manifold: its triangles, and the P-NDF of one quad of them.
 
 Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
 High-Resolution Normal Maps" (2024), section 4.1. The map's texels are the vertices of a triangle
-mesh in position × normal space; the P-NDF is that mesh seen along the position axes. The functions
-stand in the paper's order and use its symbols.
+mesh in position × normal space. The P-NDF is the projection of this mesh to normals, weighted by
+the kernel k (Eq. 2). The functions follow the paper's order, from Eq. 3 to Eq. 6, and use its
+symbols.
 """
 
 from __future__ import annotations
@@ -23,37 +24,39 @@ from glintbsdf.maps.normalmap import NormalMap, map_bytes
 
 
 def cross(a, b):
-    """z component of the cross product of two vectors of the plane."""
+    """The cross product a_x b_y − a_y b_x of two plane vectors."""
     return dr.fma(a.x, b.y, -(a.y * b.x))
 
 
 # ------------------------------------------------------------------------------------------------
-#  Eq. 4 and "Preventing Jacobian singularity": the effective triangles
+#  Eq. 3, Eq. 4 and "Preventing Jacobian singularity": the effective triangles
 # ------------------------------------------------------------------------------------------------
 
 
 def equilateral(epsilon):
-    """The triangle that replaces one with |det J| < ε: first vertex from its centre, and two edges.
+    """The equilateral triangle that replaces one with |det J| < ε; its own |det J| is exactly ε.
 
-    Its own Jacobian is exactly ε. Returns three pairs of Python floats ``(a, e1, e2)``.
+    Returns three pairs of Python floats ``(a, e1, e2)``: the first vertex relative to the
+    triangle's centre, and the edges from it.
     """
     r = sqrt(2 * epsilon / (3 * sqrt(3)))  # circumradius of an equilateral triangle of area ε/2
     return (0, r), (-sqrt(0.75) * r, -1.5 * r), (sqrt(0.75) * r, -1.5 * r)
 
 
 def is_degenerate(a, diagonal, epsilon):
-    """Whether a triangle has |det J| < ε; arguments are those of :func:`effective_triangle`."""
+    """Whether a triangle has |det J| < ε (Eq. 4); arguments as in :func:`effective_triangle`."""
     n1, n2 = diagonal
-    # To the last digit the determinant of quad_density, so that both find the same ones degenerate.
+    # The same expression as in quad_density, to the last digit: both find the same triangles.
     return dr.abs(cross(n2 - n1, a - n1)) < epsilon
 
 
 def effective_triangle(a, b, c, diagonal, epsilon):
-    """The normal triangle n(Δ) on which sampling, evaluation and all bounds agree.
+    """The normal triangle n(Δ), which is the same for sampling, for evaluation and for all bounds.
 
-    ``a``, ``b``, ``c`` (``mi.Vector2f``): projected normals at the vertices. ``diagonal``: those of
-    the quad's (n1, n2), between which the replacement of a degenerate triangle is centred. Returns
-    the first vertex and the edges ``e1``, ``e2`` from it to the second and third.
+    ``a``, ``b``, ``c`` (``mi.Vector2f``) are the projected normals at the vertices. ``diagonal`` is
+    the pair (n1, n2) of the quad's normals; midway between them is the centre of the triangle that
+    replaces a degenerate one. Returns the first vertex, and the edges ``e1``, ``e2`` from it to the
+    second and the third.
     """
     n1, n2 = diagonal
     e1, e2, centre = b - a, c - a, 0.5 * (n1 + n2)
@@ -76,13 +79,13 @@ def triangles_of_quad(normals, epsilon):
 
 
 def normal_in_quad(l1, l2, normals, epsilon):
-    """The normal n(u) of a quad's effective triangles at the place (``l1``, ``l2``) ∈ [0, 1]²."""
+    """The normal n(u) of a quad's effective triangles (Eq. 3) at (``l1``, ``l2``) ∈ [0, 1]²."""
     return frame_in_quad(l1, l2, normals, epsilon)[0]
 
 
 def frame_in_quad(l1, l2, normals, epsilon):
-    """As :func:`normal_in_quad`, the columns of the Jacobian J(u), and whether the triangle there
-    is a replaced one: ``(n, ∂n/∂l1, ∂n/∂l2, degenerate)``."""
+    """The normal as in :func:`normal_in_quad`, its Jacobian, and whether the triangle was replaced:
+    ``(n, ∂n/∂l1, ∂n/∂l2, degenerate)``."""
     n0, n1, n2, n3 = normals
     upper = l1 + l2 < 1
     l1, l2 = dr.select(upper, l1, 1 - l1), dr.select(upper, l2, 1 - l2)
@@ -101,9 +104,9 @@ def frame_in_quad(l1, l2, normals, epsilon):
 
 
 def add_where(density, condition, added, active):
-    """``density + added()`` where the condition holds, in a branch skipped where it never does.
+    """``density + added()`` in the lanes where the condition holds, by a branch.
 
-    Not with derivatives: Dr.Jit (1.5) cannot record them through a branch nested in a loop.
+    With derivatives there is no branch: Dr.Jit (1.5) cannot record them through a branch in a loop.
     """
     if dr.grad_enabled(added()):
         return density + dr.select(condition, added(), 0)
@@ -113,27 +116,29 @@ def add_where(density, condition, added, active):
 
 
 def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
-    """``added(*sums)`` in the lanes that need it, in a branch; with derivatives, in all, as
-    :func:`add_where` does."""
+    """``added(*sums)`` in the lanes that need it, and ``sums`` in all others; by a branch, under
+    the same condition as in :func:`add_where`."""
     if dr.grad_enabled(added(*sums)):
         return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
     return dr.if_stmt(sums, needed, added, lambda *sums: sums)
 
 
 def quad_density(m, corner, kernel, normals, epsilon, active):
-    """What one quad adds to D(m) (Eq. 5): k(u* − x) / |det J| for each triangle that contains m.
+    """The terms of one quad in D(m) (Eq. 5): k(u* − x) / |det J| for each triangle that contains m.
 
-    The triangles (n0, n1, n2) and (n3, n2, n1) share the diagonal e = n2 − n1, so barycentric
-    coordinates are taken from n1: m − n1 = λ0 (n0 − n1) + λ2 e in the one, λ3 (n3 − n1) + λ2' e in
-    the other. What few quads need stands in branches: a hit at all, a hit of both triangles, which
-    takes a mesh that folds over between them, and degenerate triangles.
+    The triangles (n0, n1, n2) and (n3, n2, n1) share the diagonal e = n2 − n1, so both have
+    barycentric coordinates about n1. In the first, m − n1 = λ0 (n0 − n1) + λ2 e, in the second,
+    m − n1 = λ3 (n3 − n1) + λ2' e. There are branches for the cases that are rare: that m hits a
+    triangle, that it hits both, as the mesh folds over along the diagonal, and degenerate
+    triangles.
 
     Args:
         m (mi.Vector2f): projected normal.
-        corner (mi.Vector2f): position of n0 from the footprint's centre, texels.
+        corner (mi.Vector2f): position of n0 relative to the footprint's centre, texels.
         kernel (TexelKernel): k.
         normals: projected normals (n0, n1, n2, n3), ``mi.Vector2f``.
-        epsilon (float): smallest |det J|.
+        epsilon (float): smallest |det J|, ε.
+        active (mi.Bool): mask of the lanes.
     """
     n0, n1, n2, n3 = normals
     e, a0, a3, q = n2 - n1, n0 - n1, n3 - n1, m - n1
@@ -149,19 +154,19 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
     in_lower = (l3 >= 0) & (l2 >= 0) & (l3 + l2 <= 1) & ~tiny_lower
     u_lower = corner + mi.Vector2f(1 - l2, l2 + l3)
 
-    def weighed(inside, u, inverse):
-        # Lanes outside must stay finite: 0 · ∞ would be NaN in the derivatives.
+    def term(inside, u, inverse):
+        # Values outside of the triangle must stay finite: 0 · ∞ would be NaN in derivatives.
         u, inverse = dr.select(inside, u, corner), dr.select(inside, inverse, 0)
         return kernel.value(u) * dr.abs(inverse)
 
     def hit():
-        density = weighed(
+        density = term(
             in_upper | in_lower,
             dr.select(in_upper, u_upper, u_lower),
             dr.select(in_upper, inverse_upper, inverse_lower),
         )
         return add_where(
-            density, in_upper & in_lower, lambda: weighed(in_lower, u_lower, inverse_lower), active
+            density, in_upper & in_lower, lambda: term(in_lower, u_lower, inverse_lower), active
         )
 
     density = add_where(mi.Float(0), in_upper | in_lower, hit, active)
@@ -179,9 +184,10 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
 
 
 class TexelMesh:
-    """The position-normal manifold: texels as vertices of triangles, without any search structure.
+    """The position-normal manifold: a mesh whose vertices are the texels, without a structure for
+    search.
 
-    Belongs to the variant of Mitsuba that is active when it is made.
+    It belongs to the variant of Mitsuba that is active when it is made.
 
     Args:
         normal_map (NormalMap): the map.
@@ -193,7 +199,8 @@ class TexelMesh:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
             change of its values, :meth:`parameters_changed` rebuilds what depends on them.
 
-    Raises :class:`~.ParameterError`.
+    Raises:
+        ParameterError: ``kernel`` or ``epsilon`` is not allowed.
     """
 
     def __init__(
@@ -233,7 +240,8 @@ class TexelMesh:
         return self.frame_at(u, active)[0]
 
     def frame_at(self, u: mi.Point2f, active: bool | mi.Bool = True) -> tuple:
-        """As :meth:`normal_at`, and what :func:`frame_in_quad` tells besides."""
+        """The normal n(u) at the position ``u`` (texels), its Jacobian, and whether the triangle
+        was replaced; see :func:`frame_in_quad`."""
         column, row = floor_int(u.x), floor_int(u.y)
         l1, l2 = u.x - column, u.y - row
         n0, n1, n2, n3 = self.quad_normals(
@@ -250,7 +258,7 @@ class TexelMesh:
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check new data, and take them up. Derivatives keep flowing to them."""
+        """Check new data, and use them. Derivatives keep flowing to the data."""
         if keys and "data" not in keys:
             return
         self.normal_map = NormalMap(
