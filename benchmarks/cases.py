@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -15,6 +14,7 @@ import numpy as np
 
 from benchmarks.harness import ROOT, Run
 from glintbsdf import Footprint, NormalMap, maps
+from glintbsdf.core.garbage import collect_former_scenes
 from glintbsdf.maps.quilting import synthesise
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.scene.rendering import pixel_angle
@@ -234,7 +234,7 @@ def curved_patch(
     Lights of another radius keep their power.
     """
     dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba reads no image with a single one
-    gc.collect()  # no BSDF of a former scene may go while Dr.Jit records all that are alive
+    collect_former_scenes()
     text = (SCENES / "curved_patch.xml").read_text()
     start = text.index('<bsdf type="glint_manifold">')
     end = text.index("</bsdf>", start) + len("</bsdf>")
@@ -282,7 +282,7 @@ def picture_of(
     shape: dict, origin: list, up: list, fov: float, size: int, lights: dict, **options
 ) -> mi.Scene:
     """A square picture of one shape around the origin; ``options``: spp, max_depth, rfilter."""
-    gc.collect()  # as above
+    collect_former_scenes()
     film = {"type": "hdrfilm", "width": size, "height": size}
     film["rfilter"] = {"type": options.get("rfilter", "box")}
     sampler = {"type": "independent", "sample_count": options.get("spp", 16)}

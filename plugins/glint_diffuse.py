@@ -74,6 +74,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import FootprintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.microfacet.frame import above_horizon
 from glintbsdf.pndf.manifold.diffuse import FacetDiffuse, OrenNayarDiffuse
@@ -175,4 +176,4 @@ class GlintDiffuse(FootprintBSDF):
         }
 
 
-mi.register_bsdf("glint_diffuse", lambda props: GlintDiffuse(props))
+register_plugin("glint_diffuse", GlintDiffuse)

@@ -120,6 +120,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import MAP_SOURCES, Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Elements, Flakes
 
@@ -154,4 +155,4 @@ class GlintElements(GlintBSDF):
         return Elements(self.normal_map, domain=domain, **self.options)
 
 
-mi.register_bsdf("glint_elements", lambda props: GlintElements(props))
+register_plugin("glint_elements", GlintElements)

@@ -105,6 +105,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS
@@ -141,4 +142,4 @@ class GlintFiltered(GlintBSDF):
         return Filtered(self.normal_map, domain=domain, **self.options)
 
 
-mi.register_bsdf("glint_filtered", lambda props: GlintFiltered(props))
+register_plugin("glint_filtered", GlintFiltered)

@@ -135,6 +135,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Grid
@@ -183,4 +184,4 @@ class GlintGrid(GlintBSDF):
         return Grid(**self.options)
 
 
-mi.register_bsdf("glint_grid", lambda props: GlintGrid(props))
+register_plugin("glint_grid", GlintGrid)

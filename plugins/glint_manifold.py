@@ -134,6 +134,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.kernels import KERNELS
@@ -188,4 +189,4 @@ class GlintManifold(GlintBSDF):
         return [name for name, value in features.items() if not value] + super().left_out()
 
 
-mi.register_bsdf("glint_manifold", lambda props: GlintManifold(props))
+register_plugin("glint_manifold", GlintManifold)

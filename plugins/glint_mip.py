@@ -154,6 +154,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.maps.normalmap import MapShape
 from glintbsdf.pndf import Mip
@@ -187,4 +188,4 @@ class GlintMip(GlintBSDF):
         return MapShape(size, size, self.normal_map.wrap_mode)
 
 
-mi.register_bsdf("glint_mip", lambda props: GlintMip(props))
+register_plugin("glint_mip", GlintMip)

@@ -144,8 +144,9 @@ from glintbsdf.bridge import filter_sampling
 from glintbsdf.bridge.bsdf import prepare_for_lights
 from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried, half_vector_turn
 from glintbsdf.bridge.filter_sampling import SharedFilter
+from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.bridge.separation import smooth_context
-from glintbsdf.core.errors import check, check_choice, check_whole
 from glintbsdf.footprint.pixel_filter import (
     LEAST_VARIANCE,
     PIXEL_SIGMA,
@@ -160,26 +161,20 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
     """``path`` with a footprint at every hit; documentation in the module's docstring."""
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)  # reads hide_emitters and samples_per_pass
-        separate = props.get("separate", False)
-        max_depth = props.get("max_depth", -1)
-        rr_depth = props.get("rr_depth", 5)
-        pixel_share = props.get("pixel_share", "auto")
-        light_share = props.get("light_share", "auto")
-        emitters = props.get("emitters", "all")
-        owner = props.plugin_name()
-        check_whole(
-            max_depth, lambda d: d in range(-1, 2**31), owner, "max_depth", "≥ -1 (infinite)"
-        )
-        check_whole(rr_depth, lambda d: d in range(1, 2**31), owner, "rr_depth", "> 0")
-        check(isinstance(separate, bool), owner, "separate", "true or false", separate)
-        check_share(owner, "pixel_share", pixel_share)
-        check_share(owner, "light_share", light_share)
-        check_choice(owner, "emitters", emitters, ("all", "one"))
-        self.separate = separate
+        parameters = Parameters(props)
+        parameters.refuse_unknown()
+        parameters.boolean("hide_emitters", False)
+        parameters.number("timeout", -1.0)
+        for name in ("block_size", "samples_per_pass"):
+            parameters.whole(name, None)
+        super().__init__(props)  # uses these four
+        self.separate = parameters.boolean("separate", False)
+        max_depth = parameters.whole("max_depth", -1)
         self.max_depth = max_depth if max_depth >= 0 else 0xFFFFFFFF
-        self.rr_depth = rr_depth
-        self.pixel_share, self.light_share, self.emitters = pixel_share, light_share, emitters
+        self.rr_depth = parameters.whole("rr_depth", 5)
+        self.pixel_share = parameters.share("pixel_share")
+        self.light_share = parameters.share("light_share")
+        self.emitters = parameters.choice("emitters", "all", ("all", "one"))
         self.pixels_per_differential = None
 
     # ------------------------------------------------------------------------------------------
@@ -451,18 +446,6 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         )
 
 
-def check_share(owner: str, name: str, value: object) -> None:
-    """Raise :class:`~.ParameterError` unless ``value`` is a share."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    check(
-        (isinstance(value, str) and value == "auto") or (number and 0 <= value <= 1),
-        owner,
-        name,
-        "auto or a number in [0, 1]",
-        value,
-    )
-
-
 def has_footprints(scene: mi.Scene) -> bool:
     """Whether any BSDF of the scene averages over a footprint."""
     return any(key.endswith("footprint_sigma") for key in mi.traverse(scene).keys())
@@ -682,4 +665,4 @@ def spectrum_fma(a: mi.Spectrum, b: mi.Spectrum, c: mi.Spectrum) -> mi.Spectrum:
     return a * b + c if mi.is_polarized else dr.fma(a, b, c)
 
 
-mi.register_integrator("glint_path", lambda props: GlintPathIntegrator(props))
+register_plugin("glint_path", GlintPathIntegrator)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -66,6 +67,17 @@ def variant(request: pytest.FixtureRequest) -> str:
 def each_variant(request: pytest.FixtureRequest) -> str:
     """Run the test once in a spectral, a monochromatic and a polarised variant; for short tests."""
     return _activate(request.param)
+
+
+@pytest.fixture
+def told(variant: str, capfd: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
+    """A function that returns the warnings in Mitsuba's log since its last call, a line each."""
+
+    def since() -> list[str]:
+        text = "".join(capfd.readouterr())
+        return [line for line in text.splitlines() if re.search(r"\d WARN ", line)]
+
+    return since
 
 
 @pytest.fixture(scope="session", autouse=True)

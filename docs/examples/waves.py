@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.core.errors import check
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.gaussian_elements import Gaussian
@@ -83,4 +84,4 @@ class GlintWaves(GlintBSDF):
         return Waves(**self.options, owner=self.owner)
 
 
-mi.register_bsdf("glint_waves", lambda props: GlintWaves(props))
+register_plugin("glint_waves", GlintWaves)

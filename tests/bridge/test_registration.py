@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import pytest
@@ -68,6 +70,30 @@ def test_scalar_variant_is_refused_with_the_lines_to_type(plugin):
         mi.load_string(f'<scene version="3.0.0"><{kind} type="{plugin_type}"/></scene>')
     assert f"{plugin_type}: needs a JIT variant of Mitsuba" in str(error.value)
     assert 'mi.set_variant("llvm_ad_rgb")' in str(error.value)
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 keeps what a raise has left")
+@pytest.mark.parametrize("plugin", ["glint_grid", "glint_manifold", "glint_path"])
+def test_an_error_about_a_parameter_is_one_sentence_for_who_loads_a_scene(variant, plugin):
+    with pytest.raises(RuntimeError) as error:
+        mi.load_dict({"type": plugin, "wrong": 1})
+    message = str(error.value)
+    assert f'ParameterError: {plugin}: "wrong" is not a parameter: it has ' in message
+    assert "Traceback" not in message and len(message.splitlines()) == 1
+
+
+def test_a_parameter_that_nothing_asks_for_is_refused(variant):
+    with pytest.raises(RuntimeError, match='glint_manifold: "layer" is of no use beside the other'):
+        mi.load_dict({**a_plugin(), "layer": "a"})
+
+
+def test_other_errors_keep_their_traceback(variant):
+    def broken(props):
+        raise TypeError("a fault of the plugin itself")
+
+    registration.register_plugin("glint_broken", broken)
+    with pytest.raises(RuntimeError, match="(?s)Traceback.*TypeError: a fault of the plugin"):
+        mi.load_dict({"type": "glint_broken"})
 
 
 def test_base_classes_by_their_public_name_are_those_of_the_active_variant(variant):

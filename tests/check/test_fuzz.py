@@ -37,9 +37,11 @@ def test_what_is_used_has_finite_values():
 @pytest.mark.parametrize(
     ("message", "expected"),
     [
-        ('Traceback\n  …\nParameterError: glint_grid: "alpha" must be … (got 3)', "refused"),
-        ("Traceback\n  …\nTypeError: unsupported operand", "no sentence"),
-        ('Traceback\n  …\nParameterError: glint_grid: "beta" must be …', "another parameter"),
+        ('At "root": ParameterError: glint_grid: "alpha" must be … (got 3)', "refused"),
+        ('Traceback\n  …\nParameterError: glint_grid: "alpha" must be …', "no sentence"),
+        ('At "root": ParameterError: glint_grid: "alpha" must be …\n1', "no sentence"),
+        ('At "root": ParameterError: glint_grid: "beta" must be …', "another parameter"),
+        ("At root: TypeError: unsupported operand", "other"),
     ],
 )
 def test_faults_are_told_apart(message, expected):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -36,22 +34,15 @@ def read(data, **options) -> np.ndarray:
     return NormalMap.from_array(data, **options).normals
 
 
-def told(caplog) -> list[str]:
-    """The warnings since the last call."""
-    texts = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-    caplog.clear()
-    return texts
-
-
 @pytest.mark.parametrize("channels", [2, 3])
 @pytest.mark.parametrize("dtype, tolerance", [(np.float16, 1e-3), (np.float32, 2e-7)])
-def test_floats_are_read_as_they_look(caplog, channels, dtype, tolerance):
+def test_floats_are_read_as_they_look(told, channels, dtype, tolerance):
     for numbers, encoding in ((VECTORS, "signed"), (STORED, "unsigned")):
         data = numbers[..., :channels].astype(dtype)
         for given in ("auto", encoding):
             np.testing.assert_allclose(read(data, encoding=given), NORMALS, atol=tolerance)
         # What a type alone would not tell is said once, with the remedy; what was stated is not.
-        warnings = told(caplog)
+        warnings = told()
         assert len(warnings) == (encoding == "unsigned")
         assert all('(encoding unsigned); "encoding" signed' in text for text in warnings)
 
@@ -100,9 +91,9 @@ def test_encoding_can_be_stated():
         read(STORED, encoding="srgb")
 
 
-def test_what_is_no_normal_is_told(caplog):
+def test_what_is_no_normal_is_told(told):
     read((STORED**2.2).astype(np.float32), encoding="unsigned")
-    assert any("gamma was undone" in text for text in told(caplog))
+    assert any("gamma was undone" in text for text in told())
 
 
 # -------------------------------------------------------------------------------------------------
@@ -117,24 +108,24 @@ def test_flip_y_turns_green():
         read(HEIGHT, flip_y=True)
 
 
-def test_curl_tells_which_way_green_points(caplog):
+def test_curl_tells_which_way_green_points(told):
     along, against = curl(NORMALS)
     assert along < 1e-5 and against > 0.5
     assert curl(NORMALS * (1, -1)) == pytest.approx((against, along))
     flipped = BYTES.copy()
     flipped[..., 1] = 255 - flipped[..., 1]
-    assert not told(caplog)
+    assert not told()
     read(BYTES)
-    assert not told(caplog)
+    assert not told()
     read(flipped)
-    (text,) = told(caplog)
+    (text,) = told()
     assert '"flip_y" true' in text and "OpenGL against DirectX" in text
     for stated in (False, True):
         read(flipped, flip_y=stated)
     # Nothing speaks for either in a map that is flat, or curved across one axis only.
     read(maps.flat(SIZE).normals)
     read(np.broadcast_to(BYTES[:1], BYTES.shape))
-    assert not told(caplog)
+    assert not told()
 
 
 def test_strength_is_a_factor_on_slopes():
@@ -155,7 +146,7 @@ def test_strength_is_a_factor_on_slopes():
 
 
 @pytest.mark.parametrize("low", [0.0, 0.52])
-def test_colours_that_are_nearly_grey_are_a_height(caplog, low):
+def test_colours_that_are_nearly_grey_are_a_height(told, low):
     grey = np.round(255 * (low + (1 - low) * HEIGHT)).astype(np.uint8)
     expected = read(grey, height_scale=12)
     rng = np.random.default_rng(0)
@@ -164,7 +155,7 @@ def test_colours_that_are_nearly_grey_are_a_height(caplog, low):
         rgb = np.dstack((grey, grey, blue)).astype(np.uint8)
         for map_type in ("auto", "height"):
             np.testing.assert_array_equal(read(rgb, map_type=map_type, height_scale=12), expected)
-    texts = told(caplog)
+    texts = told()
     assert len(texts) == 1 and "read as a height" in texts[0]
     assert NormalMap.from_array(noise.astype(np.uint8)).is_height
     tinted = np.round(255 * np.dstack((0.9 * HEIGHT + 0.1, HEIGHT, 0.7 * HEIGHT))).astype(np.uint8)
@@ -179,7 +170,7 @@ def test_normals_are_not_taken_for_a_height():
         assert not NormalMap.from_array(data).is_height
 
 
-def test_alpha_may_carry_x(caplog):
+def test_alpha_may_carry_x(told):
     x, y = BYTES[..., 0], BYTES[..., 1]
     full = np.full_like(x, 255)
     expected = read(BYTES[..., :2], flip_y=False)
@@ -187,7 +178,7 @@ def test_alpha_may_carry_x(caplog):
         data = np.dstack((*colours, x))
         for map_type in ("auto", "normal"):
             np.testing.assert_array_equal(read(data, map_type=map_type), expected)
-            assert any("taken from the alpha channel" in text for text in told(caplog))
+            assert any("taken from the alpha channel" in text for text in told())
     assert NormalMap.from_array(np.dstack((y, y, y, x)), "height").is_height
     # An alpha that masks, whole or in part, is no x.
     for alpha in (full, full * DISK, np.round(255 * gaussian_filter(1.0 * DISK, 1)).astype("u1")):
@@ -200,7 +191,7 @@ def test_alpha_may_carry_x(caplog):
 # -------------------------------------------------------------------------------------------------
 
 
-def test_voids_of_heights(caplog):
+def test_voids_of_heights(told):
     height = (12 * HEIGHT).astype(np.float32)
     whole = read(height)
     for value in (np.nan, np.inf, -9999, -32768, -3.4e38):
@@ -209,7 +200,7 @@ def test_voids_of_heights(caplog):
         with pytest.raises(ParameterError, match='"fill_voids" true'):
             read(data)
         filled = read(data, fill_voids=True)
-        assert any("7 of 2304 texels (0.3 %) hold nothing" in text for text in told(caplog))
+        assert any("7 of 2304 texels (0.3 %) hold nothing" in text for text in told())
         # Away from the voids nothing has changed; beside them the slope is that of one side.
         away = np.ones(height.shape, bool)
         for row, column in ((10, 10), *np.ndindex(3, 2)):
@@ -221,14 +212,14 @@ def test_voids_of_heights(caplog):
         assert slope == pytest.approx(height[10, 9] - height[10, 8], rel=1e-5)
 
 
-def test_padding_of_an_atlas(caplog):
+def test_padding_of_an_atlas(told):
     for empty, fault in ((0, "down-facing"), (128, "zero")):
         data = BYTES.copy()
         data[~DISK] = empty
         with pytest.raises(ParameterError, match=f'"fill_voids" true .* {fault}'):
             read(data)
         filled = read(data, fill_voids=True)
-        assert any("hold nothing" in text for text in told(caplog))
+        assert any("hold nothing" in text for text in told())
         np.testing.assert_array_equal(filled[DISK], read(BYTES)[DISK])
         # Each takes the normal of a texel that has one.
         inside = {tuple(normal) for normal in read(BYTES)[DISK]}

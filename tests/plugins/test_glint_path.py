@@ -118,7 +118,9 @@ def test_parameters(variant):
     for name, value in (("max_depth", -2), ("rr_depth", 0)):
         with pytest.raises((ParameterError, RuntimeError), match=f'glint_path: "{name}" must be'):
             mi.load_dict({"type": "glint_path", name: value})
-    with pytest.raises(RuntimeError, match="unreferenced property"):
+    with pytest.raises(
+        RuntimeError, match='"max_dept" is not a parameter, did you mean "max_depth"'
+    ):
         mi.load_dict({"type": "glint_path", "max_dept": 3})
 
 

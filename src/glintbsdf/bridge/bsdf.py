@@ -18,6 +18,7 @@ from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
 from glintbsdf.core.errors import ParameterError, check
+from glintbsdf.core.messages import warn
 from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
 from glintbsdf.footprint.query import Query
@@ -184,7 +185,7 @@ class FootprintBSDF(mi.BSDF):
         require_uvs(self.owner, shapes)
         doubt = doubt_of_green(self.normal_map, self.to_uv, shapes)
         if doubt:
-            mi.Log(mi.LogLevel.Warn, f'{self.owner} "{self.name}": {doubt}')
+            warn(f'{self.owner} "{self.name}": {doubt}')
 
     def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:
         """How slopes of a height map lie on the surface at ``si``; None for a map of normals, which
@@ -236,10 +237,9 @@ class FootprintBSDF(mi.BSDF):
             if is_literal_zero(self.pixel_spread)
             else "Use a mesh, or a shape of Mitsuba that has a surface."
         )
-        mi.Log(
-            mi.LogLevel.Warn,
+        warn(
             f'{self.owner} "{self.name}": {reason}, so glints are as fine as the map allows, '
-            f"whatever the distance. {remedy}",
+            f"whatever the distance. {remedy}"
         )
 
     def members(self) -> dict[str, object]:

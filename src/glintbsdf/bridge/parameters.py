@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.errors import ParameterError, check, check_choice
+from glintbsdf.core.errors import ParameterError, check, check_choice, describe
 from glintbsdf.maps.normalmap import ENCODINGS, MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.maps.reading import is_file
 from glintbsdf.microfacet.interface import Conductor, Dielectric, Interface, Mirror
@@ -186,6 +186,9 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         "max_depth": Number(-1, 2**31 - 1, whole=True),
         "rr_depth": Number(1, 2**31 - 1, whole=True),
         "hide_emitters": FLAG,
+        "timeout": Number(-1, 1e9),
+        "block_size": Number(1, 1 << 16, whole=True),
+        "samples_per_pass": Number(1, 2**32 - 1, whole=True),
         "separate": FLAG,
         "pixel_share": SHARE,
         "light_share": SHARE,
@@ -265,6 +268,13 @@ class Parameters:
         """True or false."""
         value = self.props.get(name, default)
         check(isinstance(value, bool), self.owner, name, "true or false", value)
+        return value
+
+    def share(self, name: str) -> float | str:
+        """``auto``, the default, or a number from 0 to 1."""
+        value = self.props.get(name, "auto")
+        fits = value == "auto" if isinstance(value, str) else Number(0, 1).holds(value)
+        check(fits, self.owner, name, str(SHARE), value)
         return value
 
     def only_one_of(self, *groups: tuple[str, ...]) -> None:
@@ -369,7 +379,8 @@ class Parameters:
                 bitmap = mi.Bitmap(str(path))
             except RuntimeError as error:
                 raise ParameterError(
-                    f'{self.owner}: "{name}" must be a readable image file (got "{value}": {error})'
+                    f'{self.owner}: "{name}" must be a readable image file '
+                    f"(got {describe(value)}: {' '.join(str(error).split())})"
                 ) from error
         check(isinstance(bitmap, mi.Bitmap), self.owner, name, requirement, value)
         kind = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
@@ -449,7 +460,7 @@ class Parameters:
                 choices = str(error).partition("Valid choices are:")[2].strip()
                 raise ParameterError(
                     f'{self.owner}: "{name}" must be {INDICES} or one of '
-                    f'{" ".join(choices.split())} (got "{value}")'
+                    f"{' '.join(choices.split())} (got {describe(value)})"
                 ) from None
         requirement = f"{INDICES} or the name of a material"
         check(INDICES.holds(value), self.owner, name, requirement, value)

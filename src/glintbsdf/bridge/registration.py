@@ -15,10 +15,46 @@ from collections.abc import Callable
 import mitsuba as mi
 
 from glintbsdf.bridge import llvm
+from glintbsdf.core.errors import ParameterError
 
 _PLUGINS = "glintbsdf.plugins"
 _BASE_CLASS = "glintbsdf.bridge.bsdf"
 _INTEGRATORS = ("glint_path",)  # all other plugins are BSDFs
+
+
+class VariantError(RuntimeError):
+    """A plugin is asked for in a variant of Mitsuba in which it cannot be."""
+
+
+def register_plugin(plugin_type: str, made: Callable[[mi.Properties], object]) -> None:
+    """Register a plugin in the active variant.
+
+    ``made``: the plugin's class, or whatever makes it of its properties. An integrator is known by
+    its type, see ``_INTEGRATORS``, or by its class; all else are BSDFs.
+
+    An error about a parameter, or about one that nothing asks for, reaches who loads the scene as
+    one sentence. Of other errors Mitsuba tells Python's traceback first, and then what they say; in
+    Python 3.10, of all.
+    """
+
+    def make(props: mi.Properties) -> object:
+        try:
+            plugin = made(props)
+            for name in props.unqueried():
+                raise ParameterError(
+                    f'{plugin_type}: "{name}" is of no use beside the other parameters given'
+                )
+            return plugin
+        except (ParameterError, VariantError) as error:
+            # What is raised again without a name keeps this, instead of the frames it has left.
+            error.__traceback__ = None
+            raise
+
+    is_class = isinstance(made, type) and issubclass(made, mi.Integrator)
+    if is_class or plugin_type in _INTEGRATORS:
+        mi.register_integrator(plugin_type, make)
+    else:
+        mi.register_bsdf(plugin_type, make)
 
 
 def plugin_types() -> tuple[str, ...]:
@@ -50,9 +86,7 @@ def register(variant: str) -> None:
     if variant.startswith("scalar"):
         for plugin_type in plugin_types():
             # Mitsuba remembers the kind of a type across variants: it must be the right one.
-            is_integrator = plugin_type in _INTEGRATORS
-            register_type = mi.register_integrator if is_integrator else mi.register_bsdf
-            register_type(plugin_type, _refuse(plugin_type, variant))
+            register_plugin(plugin_type, _refuse(plugin_type, variant))
         return
 
     if variant.startswith("llvm"):
@@ -70,7 +104,7 @@ def _on_variant_change(_old: str | None, new: str) -> None:
 
 def _refuse(plugin_type: str, variant: str) -> Callable[[mi.Properties], object]:
     def factory(_properties: mi.Properties) -> object:
-        raise RuntimeError(
+        raise VariantError(
             f'{plugin_type}: needs a JIT variant of Mitsuba (the active one is "{variant}"). '
             "Before the scene is loaded, type:\n"
             "    import mitsuba as mi\n"

@@ -17,7 +17,6 @@ of the stability report::
 from __future__ import annotations
 
 import multiprocessing
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -233,23 +232,19 @@ def outcome(case: Case, evaluate: bool = True) -> str:
 def judged(case: Case, message: str) -> str:
     """Whether an error is a sentence that names the plugin and a parameter that was written."""
     lines = message.strip().splitlines()
-    if "Traceback" not in message:
-        # Mitsuba's own: a value that properties cannot hold, or a parameter that is of no use here.
-        named = any(f'"{name}"' in message or name in message for name in case.changes)
-        return (
-            "refused by Mitsuba" if named or "nstantiat" not in message else "other: " + lines[-1]
-        )
-    if any(f'The property "{name}" has the wrong type' in lines[-1] for name in case.changes):
-        return "refused by Mitsuba"  # of a parameter that its base class reads
-    told = [line for line in lines if re.search(rf"{case.plugin}: ", line)]
-    if len(told) != 1:
+    if "Traceback" in message or len(lines) != 1:
         return "no sentence: " + lines[-1]
+    _, ours, told = lines[0].partition(f"ParameterError: {case.plugin}: ")
+    if not ours:
+        # Mitsuba's own: a value that properties cannot hold, or a parameter that is of no use here.
+        named = any(f'"{name}"' in message for name in case.changes)
+        return "refused by Mitsuba" if named else "other: " + lines[0]
     groups: list[Collection[str]] = [case.changes]
     if {"filename", "bitmap", "flake_density"} & set(case.changes):
         groups.append(("filename", "bitmap", "data"))
-    if any(f'"{name}"' in told[0] for group in groups for name in group):
+    if any(f'"{name}"' in told for group in groups for name in group):
         return "refused"
-    return "another parameter is named: " + told[0]
+    return "another parameter is named: " + told
 
 
 def judged_values(bsdf: Any) -> str:

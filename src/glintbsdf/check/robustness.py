@@ -6,7 +6,6 @@ The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as for the checks 
 
 from __future__ import annotations
 
-import gc
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ import numpy as np
 
 from glintbsdf.check import suite
 from glintbsdf.check.suite import View
+from glintbsdf.core.garbage import collect_former_scenes
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
 from glintbsdf.pndf import Grid
@@ -309,9 +309,8 @@ def double_error(bsdf: mi.BSDF, load: Callable[[], mi.BSDF], count: int) -> dict
         double = asked.value(bsdf, names)
         m, uv = (np.nextafter(x, np.float32(2)) for x in (asked.m, asked.uv))
         beside = replace(asked, m=m, uv=uv).value(bsdf, names)
-    # Dr.Jit records every BSDF that is alive into a rendering: none in float64 may be left.
     del bsdf
-    gc.collect()
+    collect_former_scenes()  # none in float64 may be left for the next rendering
     if double.dtype != np.float64:
         raise TypeError(f"computed in {double.dtype}")
 

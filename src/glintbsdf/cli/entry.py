@@ -53,12 +53,14 @@ def main() -> NoReturn:
 
 
 def one_line(message: str) -> str:
-    """Return an error message without the Python traceback and the place in Mitsuba's sources.
+    """Return an error message without the Python traceback, the class of the error and the place
+    in Mitsuba's sources.
 
-    Mitsuba wraps the error of a Python plugin in its own message, traceback included.
+    Mitsuba wraps the error of a Python plugin in its own message, with all of these.
     """
     message = re.sub(r"^\[\w+\.cpp:\d+\] ", "", message)
-    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+(?:[\w.]+: )?", "", message)
+    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+", "", message)
+    message = re.sub(r"(?<=: )[\w.]*Error: ", "", message)
     return " ".join(message.split())
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from glintbsdf.core.errors import warn
+from glintbsdf.core.messages import warn
 
 LIMIT = 4 << 30  # bytes
 _PREFIX = "glintbsdf-"  # the directory may hold files of others, which are never touched

@@ -5,18 +5,7 @@ It names the plugin, the parameter, what is allowed, and what came.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-
-
-def warn(message: str) -> None:
-    """Tell the user something through Mitsuba's log, the one channel for all warnings."""
-    import mitsuba as mi
-
-    if mi.variant() is None:  # Mitsuba's log speaks in a variant only
-        print(message, file=sys.stderr)
-    else:
-        mi.Log(mi.LogLevel.Warn, message)  # type: ignore[operator]  # an object in the stubs
 
 
 class ParameterError(ValueError):

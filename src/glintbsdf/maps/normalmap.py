@@ -12,7 +12,7 @@ The conventions are those of Mitsuba's ``bitmap`` and ``normalmap``:
   differences over the neighbouring texels that ``wrap_mode`` names.
 
 What ``auto`` has decided is in :attr:`NormalMap.notes`; decisions that another reading could
-contradict are logged as warnings by the logger ``glintbsdf.maps``, others as information. See
+contradict are warnings, others information (:mod:`~glintbsdf.core.messages`). See
 :mod:`~glintbsdf.maps.decoding`.
 
 This module needs NumPy only: file readers are imported when a file of their kind is read.
@@ -21,7 +21,6 @@ This module needs NumPy only: file readers are imported when a file of their kin
 from __future__ import annotations
 
 import hashlib
-import logging
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.messages import inform, warn
 from glintbsdf.maps.decoding import (
     ENCODINGS,
     MAP_TYPES,
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 __all__ = ["ENCODINGS", "MAP_TYPES", "MAX_SLOPE", "WRAP_MODES", "NormalMap", "check_texels"]
-
-logger = logging.getLogger("glintbsdf.maps")
 
 _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
 
@@ -244,8 +242,8 @@ class NormalMap:
             decoding.note(text)
         result.notes = tuple(decoding.notes)
         for note in result.notes:
-            level = logging.WARNING if note.doubtful else logging.INFO
-            logger.log(level, '%s: "%s"%s: %s', owner, parameter, name, note.text)
+            tell = warn if note.doubtful else inform
+            tell(f'{owner}: "{parameter}"{name}: {note.text}')
         return result
 
     def doubt_of_green(self, orientation: int) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from glintbsdf.core.errors import ParameterError, check
+from glintbsdf.core.errors import ParameterError, check, describe
 
 # What makes a map among the channels of an EXR file, the most telling names first.
 _EXR_LAYOUTS = (("R", "G", "B"), ("X", "Y", "Z"), ("R", "G"), ("X", "Y"), ("Y",))
@@ -75,7 +75,8 @@ def read(path: Path, map_type: str, layer: str, owner: str) -> Picture:
         raise
     except Exception as error:  # each library has its own exceptions; all of them mean this:
         raise ParameterError(
-            f'{owner}: "filename" must be a readable image file (got "{path}": {error})'
+            f'{owner}: "filename" must be a readable image file '
+            f"(got {describe(str(path))}: {' '.join(str(error).split())})"
         ) from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import tempfile
@@ -16,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.bridge.filter_sampling import SharedFilter
+from glintbsdf.core.garbage import collect_former_scenes
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.scene import passes
 from glintbsdf.scene.denoising import denoised, guided
@@ -49,7 +49,7 @@ def load_scene(
     Dr.Jit gets a second thread where it has only one: Mitsuba would never return from reading an
     OpenEXR file.
     """
-    gc.collect()  # no BSDF of a former scene may go while Dr.Jit records all that are alive
+    collect_former_scenes()
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
     parameters = dict(parameters or {})
@@ -223,9 +223,7 @@ class Renderer:
         self._stack = ExitStack()
 
     def __enter__(self) -> Renderer:
-        # Were what is left of former scenes freed while calls of their BSDFs are recorded, Dr.Jit
-        # would follow a pointer to nothing.
-        gc.collect()
+        collect_former_scenes()
         self.shared = self._stack.enter_context(sharing(self.scene, self.sensor, self.spp))
         if self.denoise:
             self.integrator = self._stack.enter_context(guided(self.integrator))

@@ -21,9 +21,10 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.cache import load_or_build
-from glintbsdf.core.errors import check, check_whole, warn
+from glintbsdf.core.errors import check, check_whole
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.messages import warn
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
