@@ -24,11 +24,11 @@ from glintbsdf.pndf.manifold.tables import (
     count_near,
     level_counts,
     pack,
+    refinement_weights,
     refinements,
-    shares,
     spline_integral,
-    spread_variance,
-    weights_of,
+    spline_variance,
+    spline_weights,
 )
 
 EPSILON = 1e-3  # so that bins resolve the clamped triangles
@@ -91,7 +91,7 @@ def test_splines():
 @pytest.mark.parametrize("period, count", [(96, 12), (100, 9), (37, 5), (40, 3), (8, 2), (9, 1)])
 def test_shares_are_those_of_sums_of_uniform_numbers(period, count):
     """They add up to one everywhere, and are what the sampler's three numbers give."""
-    of_node = shares(period, count).toarray()
+    of_node = spline_weights(period, count).toarray()
     assert np.allclose(of_node.sum(0), 1, atol=2e-7)
     u = np.random.default_rng(1).random((3, 200_000))
     place = (count // 2 - 1 + u.sum(0)) * period / count
@@ -104,16 +104,16 @@ def test_shares_are_those_of_sums_of_uniform_numbers(period, count):
 def function_of_node(period, finest, count, node):
     """Mean of a node's function over every quad of an axis."""
     if count == finest:
-        return shares(period, finest).toarray()[node]
-    places, factors = weights_of(finest, count)
-    return factors[node] @ shares(period, finest).toarray()[places[node]]
+        return spline_weights(period, finest).toarray()[node]
+    places, factors = refinement_weights(finest, count)
+    return factors[node] @ spline_weights(period, finest).toarray()[places[node]]
 
 
 @pytest.mark.parametrize("period, count", [(96, 12), (100, 20), (45, 9), (40, 5), (8, 3)])
 def test_coarse_splines_are_sums_of_fine_ones(period, count):
     for coarse in (n for n in axis_counts(count) if count % n == 0):
         combined = [function_of_node(period, count, coarse, k) for k in range(coarse)]
-        assert np.allclose(combined, shares(period, coarse).toarray(), atol=1e-6)
+        assert np.allclose(combined, spline_weights(period, coarse).toarray(), atol=1e-6)
 
 
 @pytest.mark.parametrize("finest", [6, 12, 42])
@@ -130,7 +130,7 @@ def test_mixtures_of_splines(finest):
         mean = function @ quad
         variance = function @ quad**2 - mean**2 + 1 / 12  # that of a quad
         assert np.isclose(mean, (node + 0.5) * 60, atol=1e-3)
-        assert np.isclose(variance, spread_variance(count, finest) * 60**2, rtol=2e-4)
+        assert np.isclose(variance, spline_variance(count, finest) * 60**2, rtol=2e-4)
 
 
 def test_counts_of_nodes():
@@ -178,10 +178,10 @@ def test_normals_of_quads_over_bins(variant):
     mesh = Manifold(normal_map, epsilon=EPSILON)
     row, column = (v.ravel() for v in np.indices((64, 64)))
     bins = Bins(mesh.normal_bounds())
-    spread = bins.spread(mesh.effective_triangles, row, column)
-    assert np.allclose(spread.sum(1), 1, atol=2e-6)
-    centres = np.array(bins.normal(dr.arange(mi.UInt32, spread.shape[1]), mi.Vector2f(0.5))).T
-    mean = spread @ centres
+    masses = bins.rasterize(mesh.effective_triangles, row, column)
+    assert np.allclose(masses.sum(1), 1, atol=2e-6)
+    centres = np.array(bins.normal(dr.arange(mi.UInt32, masses.shape[1]), mi.Vector2f(0.5))).T
+    mean = masses @ centres
     triangles = mesh.effective_triangles(mi.Int(row), mi.Int(column))
     expected = np.array(sum(a + (e1 + e2) / 3 for a, e1, e2 in triangles) / 2).T
     assert (np.abs(mean - expected) < 0.5 * bins.size).all()

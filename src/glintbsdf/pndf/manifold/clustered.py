@@ -1,20 +1,22 @@
 """The P-NDF of the position-normal manifold, approximated by clusters of triangles.
 
 Wu, Luan, Hašan and Ramamoorthi, "Position-Normal Manifold for Efficient Glint Rendering on
-High-Resolution Normal Maps" (2024), section 4.2. Under a footprint of radii r_x, r_y every cluster
-may stand for its quads whose residual satisfies
+High-Resolution Normal Maps" (2024), section 4.2; the clusters themselves (Eq. 7 and 8) are in
+:mod:`~glintbsdf.pndf.manifold.cluster_fit`. Under a footprint of radii r_x, r_y, a cluster may
+replace its quads if its residual satisfies
 
-    e^l ≤ r_x r_y τ,
+    e^l ≤ r_x r_y τ.
 
-the coarsest first: a *cut* through the tree of clusters. The paper walks down the tree in every
-query. Here the cuts are made when the map is loaded, for a ladder of values of r_x r_y τ, each of
-which leaves a quarter of the elements of the one before; every rung has inverted lists, as the
-quads have them (:mod:`~glintbsdf.pndf.index.lists`), so that a query is one flat loop. A query uses
-the highest rung whose value is not above its own r_x r_y τ: the criterion holds for every cluster
-it meets, though it would allow others as well.
+The coarsest clusters that satisfy it are a *cut* through the tree of clusters. The paper walks down
+the tree in every query. Here cuts are made when the map is loaded, for some values of r_x r_y τ: a
+*ladder* of cuts. Each rung of the ladder has about a quarter as many elements, which are clusters
+and single quads, as the one below. It has its own inverted lists
+(:mod:`~glintbsdf.pndf.index.lists`), so that a query is one flat loop. A query uses the highest
+rung whose value is at most its own r_x r_y τ. So the criterion holds for every cluster that it
+meets, even if it would allow further ones.
 
-Evaluation and sampling use the same rung, hence the same triangles, which tile the texel lattice:
-the mass is 1 and the density of samples exact at every setting.
+Evaluation and sampling use the same rung, and so the same triangles. These tile the texel lattice.
+So D integrates to 1, and samples have exactly the density D, at every setting.
 """
 
 from __future__ import annotations
@@ -53,26 +55,25 @@ from glintbsdf.pndf.manifold.mesh import (
     triangles_of_quad,
 )
 
-#: Rung k of the ladder has at most this share, to the power k, of the quads' number of elements.
-#: Its blocks have the side BLOCK·2^k, as its elements are 2^k wide on average; none of them is
+#: Rung k of the ladder has at most RUNG^k times as many elements as there are quads. An element is
+#: then 2^k quads wide on average. The side of the rung's blocks is BLOCK·2^k, and no element is
 #: larger than a block.
 RUNG = 0.25
 
-#: The first rung that is made. On rough maps, lists of a quarter of the elements take as long as
-#: the lists of the quads, because larger triangles reach into more cells of normals: they would
-#: bring an error for nothing. From a sixteenth on they are faster. Smooth maps reach higher rungs
-#: at once.
+#: The first rung that is made. With a quarter of the elements, on rough maps, a query is no faster
+#: than with single quads, as larger triangles reach into more cells of normals. With a sixteenth it
+#: is faster.
 FIRST_RUNG = 2
 
-#: A map that goes on as its border does (clamp) is stored with borders as wide as the largest
-#: block, which may be at most this share of the map.
+#: With the wrap mode clamp, the borders of the stored map are as wide as the largest block. This
+#: block may be at most this share of the map.
 BORDER = 1 / 16
 
-#: Memory allowed for the lists of the first rung, bytes per element; twice as much on each further
-#: one. Higher rungs have few elements, but these reach far in the plane of normals.
+#: Memory allowed to the lists of the first rung, bytes per element; twice as much on each further
+#: rung. Higher rungs have few elements, but these reach far in the plane of normals.
 BYTES_PER_ELEMENT = 120
 
-#: Bits of the first word of an element that hold its column; the level has the others.
+#: Number of bits for the column in the first word of an element; the other bits are its level.
 COLUMN_BITS = 27
 
 
@@ -82,21 +83,22 @@ COLUMN_BITS = 27
 
 
 def on_cut(residuals: list[np.ndarray], threshold: float) -> list[np.ndarray]:
-    """Which clusters of each level 1, 2, … are on the cut: the coarsest with e^l ≤ ``threshold``.
+    """The clusters of each level 1, 2, … on the cut: the coarsest ones with e^l ≤ ``threshold``.
 
-    ``residuals``: the residuals of all levels that may be used, (rows, columns) each. A cluster
-    that the border of the stored lattice would cut through does not exist: its children stand for
-    themselves.
+    ``residuals`` are the residuals of all levels that may be used, (rows, columns) each. There is
+    no cluster across the border of the stored lattice, only its children inside. Returns an array
+    of truth values for each level.
     """
     result = []
-    taken = None  # by an ancestor
+    covered = None  # by the cut, on the level above
     for residual in reversed(residuals):
         within = np.zeros(residual.shape, bool)
-        if taken is not None:
-            within[: 2 * taken.shape[0], : 2 * taken.shape[1]] = taken.repeat(2, 0).repeat(2, 1)
-        small = residual <= threshold
-        result.append(small & ~within)
-        taken = small | within
+        if covered is not None:
+            rows, columns = covered.shape
+            within[: 2 * rows, : 2 * columns] = covered.repeat(2, 0).repeat(2, 1)
+        allowed = residual <= threshold
+        result.append(allowed & ~within)
+        covered = allowed | within
     return result[::-1]
 
 
@@ -122,7 +124,8 @@ def smallest_threshold(quads: int, residuals: list[np.ndarray], most: float, lim
 def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: float) -> list[tuple]:
     """The ladder: for each rung its threshold, its cut, and log2 of the side of its blocks.
 
-    ``rungs`` is the highest that there may be, ``limit`` the largest threshold that matters.
+    ``rungs`` is the number of the highest rung possible, ``limit`` the largest threshold of any
+    query.
     """
     cuts: list[tuple[float, list, int]] = []
     for rung in range(FIRST_RUNG, rungs + 1):
@@ -130,7 +133,7 @@ def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: floa
         threshold = smallest_threshold(quads, usable, quads * RUNG**rung, limit)
         if threshold is None:
             break
-        # Rungs that no query would use are left out: the next one has no higher threshold.
+        # No query would use a rung below this one whose threshold is as high.
         cuts = [cut for cut in cuts if cut[0] < threshold]
         cuts.append((threshold, on_cut(usable, threshold), SHIFT + rung))
     return cuts
@@ -139,8 +142,9 @@ def choose_cuts(quads: int, residuals: list[np.ndarray], rungs: int, limit: floa
 def elements_of(cut: list[np.ndarray], rows: int, columns: int, block: int):
     """The elements of a cut, block by block.
 
-    Returns columns, rows and levels of their upper left quads, and the first element of every block
-    of side ``block`` (one more, the number of all).
+    Returns, for all elements, the column and the row of the upper left quad, and the level. The
+    fourth array has the index of the first element of every block of side ``block``, and the total
+    number at its end.
     """
     single = np.ones((rows, columns), bool)
     parts = []
@@ -166,16 +170,16 @@ def elements_of(cut: list[np.ndarray], rows: int, columns: int, block: int):
 
 
 class ClusterLattice:
-    """The quads over which clusters are made, and the place of each cluster among all.
+    """The lattice of quads over which clusters are made, and the index of each cluster.
 
     Attributes:
-        x, y (LatticeAxis): columns and rows. Where the map is clamped, their borders are wider than
-            those of the mesh, see :data:`BORDER`.
+        x, y (LatticeAxis): columns and rows. With the wrap mode clamp, the borders are wider than
+            the mesh's, see :data:`BORDER`.
         rungs (int): the highest rung of the ladder, 0 where the map is too small for any.
         levels (int): number of levels of clusters.
         shapes (list of pairs): rows and columns of whole clusters, by level; level 0 is the quads.
-        first (list): clusters of lower levels than each, and the number of all.
-        surplus (int): a quad of the mesh has this more as row and column here.
+        first (list): index of the first cluster of each level, and the total number.
+        surplus (int): the row of a quad here minus its row in the mesh; the same for columns.
     """
 
     def __init__(self, height: int, width: int, wrap_mode: str) -> None:
@@ -193,9 +197,9 @@ class ClusterLattice:
         self.surplus = block - BLOCK if wrap_mode == "clamp" else 0
 
     def cluster(self, row, column, level):
-        """Index of the cluster that holds a quad, and whether there is one.
+        """Index of the cluster of a level that holds a quad, and whether there is one.
 
-        ``level``: a number ≥ 1, or one per lane, where 0 gives no index.
+        ``level``: a number ≥ 1, or one number per lane; where it is 0 the index has no meaning.
         """
         if isinstance(level, int):
             numbers = self.first[level], *self.shapes[level]
@@ -207,7 +211,7 @@ class ClusterLattice:
 
 
 class CellsOfRung(NormalCells):
-    """The cells of normals of one rung per lane, see :class:`Ladder`."""
+    """The cells of normals of a rung, which may differ from lane to lane; see :class:`Ladder`."""
 
     def __init__(self, ladder: Ladder, rung, active) -> None:
         self.origin, self.pixels = ladder.origin, ladder.pixels
@@ -216,31 +220,34 @@ class CellsOfRung(NormalCells):
         self.begin = ladder.begin("slab_of_x", rung, active)
 
     def slab(self, x, active=True):
-        """Number of a slab among those of all rungs, which ``cell_of_y`` goes by."""
+        """Index of the slab of ``x`` among the slabs of all rungs, as ``cell_of_y`` has them."""
         index = mi.UInt32(dr.clip(self.pixel(x, 0), 0, RESOLUTION - 1))
         return dr.gather(mi.UInt32, self.slab_of_x, self.begin + index, active)
 
     def cell(self, m, active=True):
-        """Index of the cell of ``m`` among those of all rungs, which ``start`` goes by."""
+        """Index of the slab of ``m`` among the slabs of all rungs, and of its cell in the slab."""
         slab = self.slab(m.x, active)
         return slab, self.cell_in_slab(slab, m.y, active)
 
 
 class Ladder:
-    """A ladder of cuts through the tree of clusters, with inverted lists for each.
+    """A ladder of cuts through the tree of clusters, with inverted lists for each cut.
 
-    It is made of the arrays (NumPy) that :meth:`build` returns; there are K rungs:
-        ``thresholds`` (K): the least r_x r_y τ of the queries that use the cuts 1…K; cut 0 has no
-        clusters at all. Where K = 0, there is no other array;
-        ``residuals`` (N): residuals of the clusters of all levels that are reached, level by level;
-        ``normals`` (N, 4, 2): normals of these clusters;
-        ``shifts`` (K): log2 of the side of the blocks;
-        ``lower``, ``upper`` (2), ``divisions`` (K): the rectangle of normals, and its cells;
-        ``elements`` (…, 2): column and level, and row, of the elements, block by block;
-        ``first_of_row``: the first of each row of blocks;
-        and the arrays of :class:`~.QuadLists`, whose entries are places among the elements of a row
-        of blocks. The arrays of all rungs stand one after the other; ``begin`` (K, …) says where
-        each begins.
+    It is made of the arrays (NumPy) that :meth:`build` returns. With K rungs and N clusters, these
+    are
+
+    * ``thresholds`` (K): the smallest r_x r_y τ of queries that use the rungs 1…K. Rung 0 has no
+      clusters. With K = 0 there are no further arrays;
+    * ``residuals`` (N): residuals of the clusters of all levels in use, level by level;
+    * ``normals`` (N, 4, 2): vertex normals of these clusters;
+    * ``shifts`` (K): log2 of the side of the blocks;
+    * ``lower``, ``upper`` (2), ``divisions`` (K): the rectangle of normals, and its cells;
+    * ``elements`` (…, 2): two words per element, of column and level, and of the row; block by
+      block;
+    * ``first_of_row``: index of the first element of each row of blocks;
+    * the arrays of :class:`~.QuadLists`. Their entries are indices among the elements of a row of
+      blocks;
+    * ``begin`` (K, …): where the part of each rung begins in the joined arrays (:attr:`JOINED`).
     """
 
     start: mi.UInt32
@@ -277,7 +284,7 @@ class Ladder:
         return self.entries.nbytes + self.offset.nbytes + 4 * sum(dr.width(v) for v in words)
 
     def begin(self, name: str, rung, active):
-        """Where a rung's part of a joined array begins."""
+        """Index at which a rung's part of a joined array begins."""
         index = rung * len(self.JOINED) + self.JOINED.index(name)
         return dr.gather(mi.UInt32, self.begins, index, active)
 
@@ -286,14 +293,14 @@ class Ladder:
     # --------------------------------------------------------------------------------------------
 
     def rung(self, allowed):
-        """The rung for r_x r_y τ = ``allowed``; 0: no clusters."""
+        """The rung for r_x r_y τ = ``allowed``; rung 0 has no clusters."""
         rung = mi.UInt32(0)
         for threshold in self.thresholds:
             rung = dr.select(allowed >= opaque(mi.Float, threshold), rung + 1, rung)
         return rung
 
     def level_at(self, row, column, rung, active):
-        """Level of the element of the rung to which a stored quad belongs."""
+        """Level of the element of the rung that holds a stored quad."""
         active = active & (rung > 0)
         allowed = dr.gather(mi.Float, self.allowed, rung - 1, active)
         largest = dr.gather(mi.UInt32, self.shifts, rung - 1, active)
@@ -316,7 +323,7 @@ class Ladder:
         active = active & cells.covers(m)
         slab, cell = cells.cell(m, active)
         divisions = cells.divisions
-        # Slabs are numbered through all rungs, RESOLUTION entries of ``cell_of_y`` each.
+        # Slabs are numbered across all rungs; each has RESOLUTION entries of ``cell_of_y``.
         slab = slab - self.begin("cell_of_y", rung, active) // RESOLUTION
         shift = dr.gather(mi.UInt32, self.shifts, rung, active)
         columns = ((mi.UInt32(self.lattice.x.count) - 1) >> shift) + 2  # of the table of offsets
@@ -347,11 +354,14 @@ class Ladder:
     @classmethod
     def build(cls, lattice: ClusterLattice, normals: np.ndarray, epsilon: float, limit: float,
               triangles_of) -> dict[str, np.ndarray]:  # fmt: skip
-        """Fit the clusters, choose the cuts, build their lists.
+        """Fit the clusters, choose the cuts, and build their lists.
 
-        ``normals`` (H, W, 2) are the map's; ``limit`` is the largest r_x r_y τ that can occur;
-        ``triangles_of(normals)``, given the clusters' normals (N, 4, 2), returns a function of row,
-        column, level and a mask that returns an element's two triangles.
+        Args:
+            normals: projected normals of the map, (H, W, 2).
+            epsilon (float): smallest |det J|.
+            limit (float): the largest r_x r_y τ of any query.
+            triangles_of: function of the clusters' normals (N, 4, 2) that returns a function
+                ``(row, column, level, active)``, which returns the two triangles of an element.
         """
         rows, columns = lattice.y.quads, lattice.x.quads
         clusters, residuals = [], []
@@ -426,21 +436,22 @@ class BlocksOfElements(Blocks):
         self.device_elements = mi.UInt32(self.elements.ravel())
 
     def first_of(self, block_row, block_column, offset=0):
+        """Index of the first element of a block, or of the one ``offset`` blocks further on."""
         index = block_row * self.columns + block_column + offset
         return dr.gather(mi.UInt32, self.device_first, index)
 
     def count(self, block_row, block_column):
-        """How many elements a block has."""
+        """Number of elements in a block."""
         return self.first_of(block_row, block_column, 1) - self.first_of(block_row, block_column)
 
     def shapes(self, block_row, block_column, index, active):
-        """Whether the ``index``-th of a block exists, and its two triangles."""
+        """Whether the element with this index in a block exists, and its two triangles."""
         index = self.first_of(block_row, block_column) + index
         place = unpacked(self.device_elements, index, active)
         return active, self.triangles_of_element(*place, active)
 
     def entry(self, block_row, block_column, index):
-        """What the lists say of the ``index``-th of a block: its place in the row of blocks."""
+        """The entry that stands in the lists for an element: its index in the row of blocks."""
         return self.first_of(block_row, block_column) + index - self.first_of(block_row, 0)
 
 
@@ -455,8 +466,8 @@ def unpacked(elements, index, active):
 # ------------------------------------------------------------------------------------------------
 
 
-class Scaled:
-    """A kernel seen in units of ``side`` texels, not normalised."""
+class ScaledKernel:
+    """A kernel in units of ``side`` texels, without a new normalisation."""
 
     def __init__(self, kernel, side) -> None:
         self.kernel, self.side = kernel, side
@@ -473,31 +484,31 @@ class Scaled:
     settings={"threshold": 0.004},
 )
 class ClusteredManifold(Manifold):
-    """P-NDF of a normal map by clusters of quads (section 4.2), and its exact sampler.
+    """P-NDF of a normal map by clusters of quads (section 4.2).
 
     A footprint of radii r_x, r_y (texels; 3σ for the Gaussian, 1.5σ for ``disk`` and ``box``) uses
-    clusters with a residual e^l ≤ r_x r_y τ, see :func:`~.fit_clusters`.
-    So τ is the mean squared distance (texels²) by which a cluster as large as the footprint's
-    r_x × r_y may misplace a normal; smaller ones may do so more. It bounds no error of the P-NDF,
-    which grows with it: see ``python -m benchmarks error_vs_time``. Footprints of a few texels are
-    exact, and so are maps smaller than 32 texels (512, where the map is clamped).
+    clusters with a residual e^l ≤ r_x r_y τ, see :func:`~.fit_clusters`. So in a cluster of
+    r_x × r_y texels, normals may be displaced by a mean squared distance of τ (texels²); in a
+    smaller one the distance may be larger. The error of the P-NDF grows with τ, but τ is no bound
+    on it; ``python -m benchmarks error_vs_time`` measures it. Footprints of a few texels are exact,
+    and so are maps smaller than 32 texels (512, with the wrap mode clamp).
 
-    A cluster's triangle of an area below ε/2 on the disk, whatever its size in texels, is replaced
-    like a triangle of the map: a flat part of the map keeps the size that its highlight has without
-    clusters.
+    A cluster's triangle is replaced like a triangle of the map where its area on the disk is below
+    ε/2, whatever its size in texels. So the highlight of a flat part of the map has the same size
+    with and without clusters.
 
     Args:
         normal_map (NormalMap): the map.
         threshold (float): τ > 0.
-        kernel, epsilon, owner: as for :class:`~.TexelMesh`.
-        domain: as for :class:`~.Manifold`; clusters are made of the whole map
-            all the same.
+        kernel, epsilon, owner: as in :class:`~.TexelMesh`.
+        domain: as in :class:`~.Manifold`; clusters are always made for the whole map.
 
     Attributes:
         ladder (Ladder): the cuts; None where no footprint would use a cluster.
-        data (mi.TensorXf): as in ``TexelMesh``.
+        data (mi.TensorXf): as in :class:`~.TexelMesh`.
 
-    Raises :class:`~.ParameterError`.
+    Raises:
+        ParameterError: an argument is out of range.
     """
 
     def __init__(
@@ -515,7 +526,7 @@ class ClusteredManifold(Manifold):
         super().__init__(normal_map, kernel, epsilon, owner, domain)
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make lists and clusters; the cache may know most of it. Clusters are always complete."""
+        """Build lists and clusters, or load them from the cache; clusters are of the whole map."""
         super().build(domain)
         self.ladder = None
         if self.stand_in is not None:
@@ -524,23 +535,24 @@ class ClusteredManifold(Manifold):
         height, width, _ = self.data.shape
         self.clusters = ClusterLattice(height, width, self.normal_map.wrap_mode)
         self.quad_vertices = dr.width(self.vertices) // 2
-        quads_alone = self.vertices
+        vertices_of_quads = self.vertices
 
         def triangles_of(normals):
-            self.vertices = dr.concat([dr.detach(quads_alone), mi.Float(normals.ravel())])
+            self.vertices = dr.concat([dr.detach(vertices_of_quads), mi.Float(normals.ravel())])
             return self.element_triangles
 
-        # The largest footprint of the widest kernel.
+        # r_x r_y τ of the largest footprint, with the widest kernel.
         limit = self.threshold * (max(REACH.values()) * SIGMA_MAX) ** 2 * height * width
 
         def build_ladder() -> dict[str, np.ndarray]:
             return Ladder.build(self.clusters, self.data.numpy(), self.epsilon, limit, triangles_of)
 
         arrays = self.cached(build_ladder, self.epsilon, self.threshold)
-        self.vertices = quads_alone
+        self.vertices = vertices_of_quads
         if len(arrays["thresholds"]):
             self.ladder = Ladder(self.clusters, arrays)
-            self.vertices = dr.concat([mi.Float(quads_alone), mi.Float(arrays["normals"].ravel())])
+            normals = mi.Float(arrays["normals"].ravel())
+            self.vertices = dr.concat([mi.Float(vertices_of_quads), normals])
 
     def element_normals(self, row, column, level, active):
         """Normals n_0^l…n_3^l of an element: a cluster, or a quad of the map at level 0."""
@@ -570,10 +582,10 @@ class ClusteredManifold(Manifold):
         """The rung of the ladder for a kernel: the highest that its r_x r_y τ allows."""
         if self.kernel == "box":
             radii = kernel.half_u * kernel.half_v
-        else:  # the principal ones, of a rotated footprint
+        else:  # the radii along the principal axes
             radii = REACH[self.kernel] ** 2 * kernel.sigma_u_given_v * kernel.sigma_v
-        few = kernel.touched_quads() <= tuning().few_quads
-        return dr.select(few, 0, self.ladder.rung(radii * self.threshold))
+        small = kernel.touched_quads() <= tuning().few_quads
+        return dr.select(small, 0, self.ladder.rung(radii * self.threshold))
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk; 0 outside of it."""
@@ -586,9 +598,9 @@ class ClusteredManifold(Manifold):
         def add(density, row, column, level, corner, active):
             normals = self.element_normals(row, column, level, active)
             side = mi.Float(1 << level)
-            # In units of the side, where an element is a quad: |det J| is 4^l times that per texel.
+            # In units of its side an element is a quad, and |det J| is 4^l times as large.
             added = quad_density(
-                m, corner / side, Scaled(kernel, side), normals, self.epsilon, active
+                m, corner / side, ScaledKernel(kernel, side), normals, self.epsilon, active
             )
             return density + dr.select(active, side * side * added, 0)
 
@@ -598,9 +610,9 @@ class ClusteredManifold(Manifold):
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """Draw a projected normal with density D: the normal n^l at a place drawn from k.
+        """Draw a projected normal with density D: the normal n^l at a position drawn from k.
 
-        ``sample1`` is not needed.
+        ``sample1`` is not used.
         """
         if self.ladder is None:
             return super()._sample(query, sample1, sample2, active)
@@ -609,7 +621,7 @@ class ClusteredManifold(Manifold):
         x, y = floor_int(u.x), floor_int(u.y)
         row, column = self.clusters.y.locate(y)[1], self.clusters.x.locate(x)[1]
         level = self.ladder.level_at(row, column, self.rung(kernel), active)
-        inside = (1 << mi.Int(level)) - 1  # of a column or row, the part that lies in the element
+        inside = (1 << mi.Int(level)) - 1  # mask of the bits of a column or row within the element
         side = dr.rcp(mi.Float(1 << level))
         l1 = ((u.x - x) + (column & inside)) * side
         l2 = ((u.y - y) + (row & inside)) * side

@@ -6,37 +6,36 @@ High-Resolution Normal Maps" (2024), section 4.3 and its supplement. The project
     P(ω) = ∫ D(m̃) max(m̃·ω, 0) dm̃                                                         (Eq. 9)
          = Σ_Δ k(Δ)/2 · mean over n(Δ) of max(m̃·ω, 0)/m_z                                  (Eq. 10)
 
-is a sum over the triangles of the manifold, once the kernel is taken as constant on each of them.
+is a sum over the triangles of the manifold, if the kernel is constant on each of them.
 
 **One triangle.** The paper turns the mean into integrals along the boundary of the triangle's
-visible part (Eq. 11, 12, Algorithm 1). They are exact, and useless in float32: terms of the size of
+visible part (Eq. 11, 12, Algorithm 1). They are exact, but useless in float32: terms of the size of
 the triangle's edges cancel to its area, and near the horizon to much less. Here the visible part is
-the same, a polygon of at most six corners and, beyond those of its sides that are chords of the
-ellipse, lenses up to the ellipse; but each piece is integrated by terms that are all positive, from
-``q = m̃·ω`` at the corners alone:
+the same. It is a polygon of at most six corners. Where one of its sides is a chord of the horizon's
+ellipse, there is also a lens between this chord and the ellipse. Each of these pieces is integrated
+by terms that are all positive, from ``q = m̃·ω`` at the corners alone:
 
-* between corners the unit normal bulges over the flat triangle. With barycentric coordinates λ,
+* Between corners, the unit normal bulges over the flat triangle. With barycentric coordinates λ,
   squared chords c_ij² = \|ñ_i − ñ_j\|² of the *unit* normals, and V = Σ λ_i λ_j c_ij² (i < j),
 
-      m_z = √((Σ λ_i z_i)² + V),      q = Σ λ_i q_i + ω_z V / (m_z + Σ λ_i z_i),
+      m_z = √((Σ λ_i z_i)² + V),      q = Σ λ_i q_i + ω_z V / (m_z + Σ λ_i z_i).
 
-  and q/m_z is averaged by a product rule of Gauss, in coordinates in which m_z varies smoothly
-  through the disk's rim (:func:`mean_facing`);
-* a lens has a one-dimensional integral whose cancellation can be carried out by hand
-  (:func:`lens`).
+  A product rule of Gauss averages q/m_z. Its coordinates are such that m_z varies smoothly up to
+  the rim of the disk (:func:`mean_facing`).
+* A lens has a one-dimensional integral, whose cancellation is resolved on paper (:func:`lens`).
 
-Nothing is divided by the triangle's area but the lens, which is smaller than the area by
-construction: triangles may be as thin as they like.
+Only the area of a lens is divided by the triangle's area, and the lens is the smaller of the two.
+So triangles may be arbitrarily thin.
 
-**All triangles under the footprint** count, whatever their normals: the lists of the P-NDF, which
-are sorted by normal, do not apply. See :class:`ProjectedArea`.
+**All triangles under the footprint** count, whatever their normals. So the lists of the P-NDF,
+which are sorted by normal, are of no use here; see :class:`ProjectedArea`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from math import exp, inf, sqrt
+from math import inf, sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -46,7 +45,7 @@ from glintbsdf.core.hashing import pcg3d
 from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import REACH, TexelKernel, difference_of_products
+from glintbsdf.footprint.kernels import VARIANCE, TexelKernel, difference_of_products
 from glintbsdf.footprint.lattice import Lattice, floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.microfacet.masking import MeanPlaneMasking
@@ -73,16 +72,17 @@ from glintbsdf.pndf.manifold.mesh import (
     where_needed,
 )
 
-#: |q| below which a corner counts as lying on the horizon: products of two must not underflow.
+#: A corner with |q| below this counts as being on the horizon: the product of two must not
+#: underflow.
 HORIZON = 1e-15
 
 # ------------------------------------------------------------------------------------------------
-#  A triangle that is visible as a whole
+#  A triangle that is visible as a whole (Eq. 10)
 # ------------------------------------------------------------------------------------------------
 
 
 def gauss(order: int) -> list[tuple[float, float]]:
-    """Nodes and weights of Gauss and Legendre's rule on [0, 1]."""
+    """Nodes and weights of the Gauss-Legendre rule on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
     return [(float(0.5 * x + 0.5), float(0.5 * w)) for x, w in zip(nodes, weights, strict=True)]
 
@@ -90,8 +90,8 @@ def gauss(order: int) -> list[tuple[float, float]]:
 def rim_steps(z0, z_half, z1, order: int):
     """Nodes s and weights on [0, 1] for functions of s that have m_z in the denominator.
 
-    ds/dτ is the parabola through the heights ``z0``, ``z_half``, ``z1`` at both ends and between,
-    so that 1/m_z, which is singular where an end lies on the rim of the disk, is smooth in τ.
+    ds/dτ is the parabola through the heights ``z0``, ``z_half``, ``z1`` at s = 0, ½ and 1. So 1/m_z
+    is smooth in τ, although it is singular in s where an end lies on the rim of the disk.
     """
     scale = 6 / dr.maximum(z0 + 4 * z_half + z1, 1e-20)
     steps = []
@@ -109,13 +109,13 @@ def rim_steps(z0, z_half, z1, order: int):
 
 
 def mean_facing(q, z, chords, w_z, order: int):
-    """Mean over a triangle of projected normals of m̃·ω/m_z, where it is positive at all corners.
+    """Mean of m̃·ω/m_z over a triangle of projected normals, if m̃·ω ≥ 0 at all corners.
 
     Args:
         q, z: m̃·ω and m_z at the three corners.
         chords: squared chords (c01², c02², c12²) between the unit normals of the corners.
         w_z: ω_z.
-        order (int): nodes of the rule along either of its two axes.
+        order (int): number of nodes along each of the two axes.
     """
     c01, c02, c12 = chords
 
@@ -123,7 +123,7 @@ def mean_facing(q, z, chords, w_z, order: int):
         return dr.safe_sqrt(dr.fma(flat, flat, bulge))
 
     total, weights = mi.Float(0), mi.Float(0)
-    # Rays from corner 0 to the places t of the opposite side.
+    # Rays from corner 0 to the points t of the opposite side.
     for t, weight_t in rim_steps(z[1], height(0.5 * (z[1] + z[2]), 0.25 * c12), z[2], order):
         # At s = 1, and at s < 1: λ = (1 − s, s (1 − t), s t).
         q_side, z_side = dr.lerp(q[1], q[2], t), dr.lerp(z[1], z[2], t)
@@ -143,19 +143,19 @@ def mean_facing(q, z, chords, w_z, order: int):
 
 
 # ------------------------------------------------------------------------------------------------
-#  Clipping at the horizon m̃·ω = 0
+#  Clipping at the horizon m̃·ω = 0 (Eq. 11, 12, Algorithm 1)
 # ------------------------------------------------------------------------------------------------
 
 
 def visible_interval(q_u, q_v, z_u, z_v, chord, w_z):
-    """The part of the edge from u to v in which m̃·ω ≥ 0 (Algorithm 1, for all its cases).
+    """The part of the edge from u to v in which m̃·ω ≥ 0 (Algorithm 1, all its cases).
 
-    m̃·ω is concave along the edge, so this is one interval; its ends are roots of the quadratic of
-    the supplement. Written in q, which is small near the horizon, instead of in positions, its
-    discriminant is a sum of two terms that do not cancel, and each root is a quotient of sums of
-    one sign.
+    m̃·ω is concave along the edge, so this part is one interval. Its ends are roots of the quadratic
+    equation in the supplement. Here the equation is written in q, which is small near the horizon,
+    instead of in positions. Its discriminant is then a sum of two terms that do not cancel, and
+    each root is a quotient of sums of one sign.
 
-    Returns ``(low, 1 − low, high, 1 − high, exists)``.
+    Returns ``(low, 1 − low, high, 1 − high, exists)``, fractions of the edge.
     """
     a, b, k = w_z * z_u, w_z * z_v, 0.5 * w_z * w_z * chord
     f0, f1 = q_u * (q_u - 2 * a), q_v * (q_v - 2 * b)
@@ -189,18 +189,21 @@ def visible_interval(q_u, q_v, z_u, z_v, chord, w_z):
 def lens(position, side, chord, order: int):
     """∫ m̃·ω/m_z dm over the lens between a chord of the horizon's ellipse and its arc.
 
-    Seen along ω the lens lies between two arcs over a common chord of length c: that of the great
-    circle m̃·ω = 0, and the projection of the circle, of radius r = √(1 − d²), that stands over the
-    line at a distance d from the origin. The difference of their heights over the chord at
-    x = y c/2 is, with h = 1 − c²/4 and κ = √((r² − c²/4)/h) the cosine between the planes,
+    Seen along ω, the lens lies between two arcs over a common chord of length c. One arc is part of
+    the great circle m̃·ω = 0. The other is the projection of the circle of radius r = √(1 − d²) that
+    stands over the chord's line, at a distance d from the origin. At x = y c/2 on the chord, the
+    difference of their heights is
 
         (c²/4)² (1 − y²)² d² / (h D_1 D_r (√(r² − x²) + κ √(1 − x²))),
 
-    where D_ρ = √(ρ² − x²) + √(ρ² − c²/4).
+    where h = 1 − c²/4, D_ρ = √(ρ² − x²) + √(ρ² − c²/4), and κ = √((r² − c²/4)/h) is the cosine of
+    the angle between the planes of the two circles.
 
     Args:
-        position, side (mi.Vector2f): first end of the chord in the disk, and the way to the second.
+        position, side (mi.Vector2f): first end of the chord in the disk, and the vector from it to
+            the second end.
         chord: squared length c² of the chord between the unit normals.
+        order (int): number of nodes.
     """
     quarter = 0.25 * chord
     length = dr.squared_norm(side)
@@ -215,12 +218,13 @@ def lens(position, side, chord, order: int):
         top_1, top_r = dr.safe_sqrt(1 - x2), dr.safe_sqrt(r2 - x2)
         divisor = (top_1 + end_1) * (top_r + end_r) * dr.fma(cosine, top_1, top_r)
         total += weight * (1 - y * y) ** 2 / dr.maximum(divisor, 1e-20)
-    # Twice, as y runs from −1 to 1; the chord's half length is one more factor.
+    # The factor 2: y runs from −1 to 1, and the rule from 0 to 1. √(c²/4) is half the chord's
+    # length.
     return 2 * total * quarter * quarter * dr.sqrt(quarter) * d2 / h
 
 
 class Corners:
-    """Unit normals at the three corners of a triangle of projected normals, and their m̃·ω.
+    """A triangle of projected normals: unit normals and m̃·ω at its three corners.
 
     Args:
         first, e1, e2 (mi.Vector2f): first corner, and edges from it to the second and third.
@@ -241,8 +245,8 @@ class Corners:
     def may_be_seen(self, w_z):
         """False only if m̃·ω < 0 on all of the triangle.
 
-        Between the corners m_z rises above the flat triangle by √(z² + V) − z at most, where z is
-        the lowest corner and V is not above a third of the longest squared chord.
+        Between the corners, m_z exceeds the flat triangle by at most √(z² + V) − z, where z is the
+        m_z of the lowest corner, and V is at most a third of the longest squared chord.
         """
         lowest = dr.minimum(dr.minimum(self.z[0], self.z[1]), self.z[2])
         bulge = dr.maximum(dr.maximum(self.chords[0], self.chords[1]), self.chords[2]) / 3
@@ -251,25 +255,27 @@ class Corners:
 
 
 def facing(m, z, w):
-    """m̃·ω, to the last digit where ω is horizontal; zero where it is lost in rounding."""
+    """m̃·ω, accurate to the last digit where ω is horizontal; 0 where it is below the rounding."""
     q = dr.fma(w.z, z, difference_of_products(w.x, m.x, -w.y, m.y))
     return dr.select(dr.abs(q) > HORIZON, q, 0)
 
 
 def squared_chord(side, sum_of_ends, sum_of_heights):
-    """Squared distance of two unit normals, from the difference and the sum of their projections.
+    """Squared distance of two unit normals.
 
-    Their heights differ by −side·sum/(sum of heights), without cancellation.
+    ``side`` is the difference of their projections, ``sum_of_ends`` their sum. The heights differ
+    by −side·sum/(sum of heights), an expression without cancellation.
     """
     rise = dr.dot(side, sum_of_ends) / dr.maximum(sum_of_heights, 1e-20)
-    # Both ends on the rim, where heights carry no digits: they differ by no more than their sum.
+    # On the rim heights have no correct digits, but they never differ by more than their sum.
     rise = dr.minimum(dr.abs(rise), sum_of_heights)
     return dr.fma(rise, rise, dr.squared_norm(side))
 
 
 def clipped_mean(corners: Corners, w_z, order: int):
     """Mean over a triangle of max(m̃·ω, 0)/m_z, for any position of the horizon."""
-    # The corner that faces ω most comes first, so that what is small is measured from it.
+    # The corner that faces ω most comes first: distances from it are small, and so are their
+    # errors.
     first = corners.q[0] >= corners.highest
     second = ~first & (corners.q[1] >= corners.highest)
 
@@ -299,7 +305,7 @@ def clipped_mean(corners: Corners, w_z, order: int):
             points.append((*barycentric, height, dr.maximum(q[corner], 0)))
         exist.append(exists)
 
-    # An edge that is not seen shrinks to the point where the boundary passes it by.
+    # An edge that is not visible shrinks to the point at which the boundary passes it.
     def choose(condition, x, y):
         return tuple(dr.select(condition, a, b) for a, b in zip(x, y, strict=True))
 
@@ -340,29 +346,30 @@ def clipped_mean(corners: Corners, w_z, order: int):
 
 
 # ------------------------------------------------------------------------------------------------
-#  All triangles under a footprint (Eq. 12)
+#  All triangles under a footprint (Eq. 10)
 # ------------------------------------------------------------------------------------------------
 
-#: Footprints that touch no more quads than this are smaller than what is constant on a triangle:
-#: the mean is taken over points of the kernel instead.
+#: For footprints that touch at most this many quads, the kernel is not nearly constant on a
+#: triangle: their mean is taken over points of the kernel.
 FEW_QUADS = 25
 
-#: Footprints that touch more quads than this see one quad of each square of 2×2, 4×4, … instead,
-#: at a place that differs from square to square, which bounds a footprint's cost. The error of P is
-#: about 0.001 for maps of roughness 0.15, and 0.005 for 0.6 (``benchmarks projected_area areas``).
+#: For footprints that touch more quads than this, the sum has one random quad of each square of
+#: 2×2, 4×4, … quads. This bounds the cost of a footprint (``benchmarks projected_area areas``
+#: measures the error).
 MANY_QUADS = 4096
 
-#: Order of the rule of Gauss by the map's longest chord between unit normals of one triangle: the
-#: relative error over random triangles is then below 1e-3 (tests/test_projected_area.py).
+#: Pairs (longest chord between unit normals of one triangle of the map, order of the Gauss rule).
+#: The relative error over random triangles is then below 1e-3
+#: (tests/pndf/manifold/test_projected_area.py).
 ORDERS = ((0.05, 2), (0.5, 3), (2.1, 6))
 
 
 class FootprintArea:
-    """P(ω) of the facets under a footprint; what the two estimates of it share.
+    """P(ω) of the facets under a footprint: the base class of two estimates.
 
     Attributes:
         mesh (TexelMesh): the manifold.
-        few (int): footprints that touch no more quads than this see :func:`mean_over_points`.
+        few (int): footprints that touch at most this many quads use :func:`mean_over_points`.
     """
 
     mesh: TexelMesh
@@ -371,7 +378,7 @@ class FootprintArea:
     def eval(
         self, w: mi.Vector3f, query: Query | Footprint, active: bool | mi.Bool = True
     ) -> mi.Float:
-        """P(ω) ≥ 0 for a unit vector with ω_z ≥ 0; at most ω_z + the mean slope's length.
+        """P(ω) ≥ 0 for a unit vector ``w`` with ω_z ≥ 0; at most ω_z + |mean slope|.
 
         ``query``: a query, or just a footprint in the UV space of the map.
         """
@@ -380,8 +387,8 @@ class FootprintArea:
     def projected_areas(
         self, directions: list, query: Query, active: mi.Bool
     ) -> tuple[list, mi.Vector2f]:
-        """``(areas, mean slope)``: as :meth:`eval` for several directions, which share what is
-        found under the footprint; and the mean of m_xy/m_z."""
+        """``(areas, mean slope)``: P(ω) for several directions, for which the triangles under the
+        footprint are visited once, and the mean of m_xy/m_z."""
         raise NotImplementedError
 
     def parts(self) -> dict[str, int]:
@@ -389,20 +396,19 @@ class FootprintArea:
         return {}
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Take up new data of the mesh."""
+        """Use new data of the mesh."""
         raise NotImplementedError
 
 
 class ProjectedArea(FootprintArea):
-    """P(ω) of the facets under a footprint, by the sum of Eq. 12.
+    """P(ω) of the facets under a footprint, by the sum of Eq. 10.
 
-    The kernel is constant on each triangle. What the box weighs of a quad between four texels is
-    known exactly, and both triangles of the quad have half of it: P is exact where the box's edges
-    lie on those of quads. The other kernels are taken at the triangle's centroid. The weights are
-    divided by their sum, so that the projected area of flat facets is exact, and P(z) = 1.
+    The kernel counts as constant on each triangle. The box kernel's mass in a quad is known
+    exactly, and each triangle of the quad has half of it. So P is exact where the edges of the box
+    coincide with edges of quads. The value of the other kernels is taken at the triangle's
+    centroid. The weights are divided by their sum, so that P of flat facets is exact, and P(z) = 1.
 
-    Footprints of a few texels would see the triangles' size in this: for them see
-    :func:`mean_over_points`.
+    For footprints of a few texels this is too coarse: they use :func:`mean_over_points`.
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
@@ -415,7 +421,7 @@ class ProjectedArea(FootprintArea):
         self.parameters_changed()
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Choose the quadrature for the data of the mesh."""
+        """Choose the order of the quadrature for the data of the mesh."""
         if keys and "data" not in keys:
             return
         with dr.suspend_grad():
@@ -439,16 +445,16 @@ class ProjectedArea(FootprintArea):
 
     def projected_areas(self, directions, query, active):
         kernel = self.mesh.texel_kernel(query)
-        few = kernel.touched_quads() <= self.few
-        by_points = mean_over_points(self.mesh, kernel, directions, active & few, self.jumps)
-        by_triangles = self.mean_over_triangles(directions, kernel, active & ~few)
-        return choose_areas(few, by_points, by_triangles)
+        small = kernel.touched_quads() <= self.few
+        by_points = mean_over_points(self.mesh, kernel, directions, active & small, self.jumps)
+        by_triangles = self.mean_over_triangles(directions, kernel, active & ~small)
+        return choose_areas(small, by_points, by_triangles)
 
     def __repr__(self) -> str:
         return "analytic"
 
     def mean_over_triangles(self, directions, kernel, active):
-        """The weighted mean over the triangles of Eq. 12, for each direction, and of the slope."""
+        """The weighted mean over triangles (Eq. 10) for each direction, and the mean slope."""
         mean = mi.Vector2f(kernel.mean)
 
         def add(x, y, row, column, active, mass, slope, *areas):
@@ -496,7 +502,7 @@ def mean_slope(first, e1, e2) -> mi.Vector2f:
 def triangle_weight(kernel: TexelKernel, corner, centroid: float):
     """Weight of a triangle of the quad at ``corner`` (texels from the footprint's centre).
 
-    ``centroid``: of the triangle in the quad, along both axes.
+    ``centroid``: the coordinate of the triangle's centroid in the quad, the same along both axes.
     """
     if kernel.kernel != "box":
         return kernel.value(corner + centroid)
@@ -508,11 +514,12 @@ def triangle_weight(kernel: TexelKernel, corner, centroid: float):
 
 
 def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
-    """Sum over the quads under the kernel, or one quad of each square of quads if they are many.
+    """Sum over the quads under the kernel, or over one quad of each square of quads.
 
-    Calls ``add(x, y, row, column, active, *sums)`` with the quad's position and where it is stored;
-    it returns the new sums. Rows of squares are followed only as far as the kernel reaches,
-    whatever the footprint's shape.
+    The side of the squares grows with the footprint, see :data:`MANY_QUADS`. Calls
+    ``add(x, y, row, column, active, *sums)`` with the quad's position (texels), and the row and
+    column at which it is stored; it returns the new sums. A row of squares is followed only as far
+    as the kernel reaches, whatever the footprint's shape.
     """
     mean = mi.Vector2f(kernel.mean)
     squares = kernel.touched_quads() * (1 / MANY_QUADS)
@@ -547,18 +554,18 @@ def every_stratum(lattice: Lattice, kernel: TexelKernel, add, sums, active):
 
 
 # ------------------------------------------------------------------------------------------------
-#  The smallest footprints
+#  Small footprints
 # ------------------------------------------------------------------------------------------------
 
-#: Points of the kernel over which the mean is taken, by the number of quads that a footprint
-#: touches at most: Fibonacci numbers.
+#: Pairs (largest number of quads that a footprint touches, number of points of its kernel). The
+#: numbers of points are Fibonacci numbers.
 POINTS = ((4, 34), (64, 55), (256, 89), (inf, 144))
 
-#: Fractional part of the golden ratio, which spreads the points evenly.
+#: Fractional part of the golden ratio: the points are a Fibonacci lattice.
 GOLDEN = (5**0.5 - 1) / 2
 
-#: Ω of the GGX area (:func:`ggx_area`) over the variance of slopes which are uniformly distributed
-#: over an interval: with it, both see the same at grazing angles.
+#: Ω of the GGX area (:func:`ggx_area`) over the variance of slopes that are uniform over an
+#: interval. With this ratio both have the same projected area at grazing angles.
 UNIFORM = 0.75
 
 
@@ -570,19 +577,23 @@ def mean_over_points(
     jumps: bool,
     roughness: mi.Float | float = 0.0,
 ) -> tuple[list, mi.Vector2f]:
-    """P(ω) for each direction, and the slope, as means over points of the kernel, all of equal
-    weight.
+    """P(ω) for each direction, and the mean slope, as means over N points of the kernel.
 
-    A point stands for a cell of the kernel, of the area 1/(N k), over which the slopes vary by the
-    triangle's Jacobian: it has the projected area of this spread, not of a single facet, so that
-    what faces ω in a corner of the cell is not missed.
+    All points have the same weight. A point stands for a cell of the kernel, of the area 1/(N k).
+    The slopes vary over the cell by the triangle's Jacobian. The point has the projected area of
+    these slopes, not of a single facet, so that facets in a corner of the cell count, too.
 
-    Degenerate triangles are single facets, whose neighbours may face anywhere: their Jacobian tells
-    nothing. Points within them do not count, and they are added with their mass under the kernel.
+    A degenerate triangle is a single facet, and the Jacobian says nothing about its neighbours. So
+    points in degenerate triangles are left out, and these triangles are added exactly, with their
+    mass under the kernel.
 
     Args:
-        mesh: the manifold; without jumps, anything with its ``frame_at``.
-        jumps (bool): whether the mesh has any; see :func:`has_degenerate_triangles`.
+        mesh: the manifold; without jumps, any object with a method ``frame_at`` like its own.
+        kernel: the footprint's kernel.
+        directions: unit vectors ω.
+        active: mask of the lanes.
+        jumps (bool): whether the mesh has degenerate triangles, see
+            :func:`has_degenerate_triangles`.
         roughness: variance of the projected normals of every facet.
     """
     quads, count = kernel.touched_quads(), mi.UInt32(POINTS[-1][1])
@@ -598,9 +609,9 @@ def mean_over_points(
         z = height_of(m)
         new = []
         for w, total in zip(directions, totals, strict=True):
-            turn = gradient_along(w, m, z)
-            spread = variance_of_cells(kernel, offset, dr.dot(turn, e1), dr.dot(turn, e2))
-            spread = dr.fma(UNIFORM * share, spread, roughness * dr.squared_norm(turn))
+            gradient = gradient_along(w, m, z)
+            spread = variance_of_cells(kernel, offset, dr.dot(gradient, e1), dr.dot(gradient, e2))
+            spread = dr.fma(UNIFORM * share, spread, roughness * dr.squared_norm(gradient))
             area = ggx_area(slope_along(w, m / z), spread)
             new.append(total + dr.select(counts, area, 0))
         found = found + dr.select(counts, mi.UInt32(1), 0)
@@ -615,7 +626,7 @@ def mean_over_points(
     if not jumps:
         return areas, slope
     mass, single_slope, *single_areas = degenerate_triangles(mesh, kernel, directions, active)
-    # The rest of the mass is that of the points, as far as there are any.
+    # The rest of the mass belongs to the points, if there are any.
     rest = dr.select(found > 0, dr.maximum(1 - mass, 0), 0)
     mass = dr.maximum(mass + rest, 1e-6)
     areas = [
@@ -636,11 +647,11 @@ def has_degenerate_triangles(mesh: TexelMesh) -> bool:
 
 
 def degenerate_triangles(mesh: TexelMesh, kernel: TexelKernel, directions: list, active) -> tuple:
-    """Mass of the degenerate triangles under the kernel, and integrals over them: of the slope, and
-    of the projected area for each direction."""
-    variance = 2 * mesh.epsilon / (3 * sqrt(3))  # the square of the circumradius: none is farther
-    # Where in a triangle the kernel has its mean: as if both were Gaussians. A triangle's variance
-    # along its legs is 1/18.
+    """``(mass, slope, *areas)`` of the degenerate triangles under the kernel: their mass, and the
+    integrals over them of the slope and, for each direction, of the projected area."""
+    variance = 2 * mesh.epsilon / (3 * sqrt(3))  # squared circumradius: no normal is farther away
+    # Position of the kernel's mean within a triangle, as if both were Gaussians. The variance of a
+    # triangle along its legs is 1/18.
     pull = [dr.rcp(1 + 18 * dr.square(x)) for x in (kernel.sigma_u, kernel.sigma_v)]
 
     def inside(corner, centroid: float):
@@ -673,10 +684,11 @@ def degenerate_triangles(mesh: TexelMesh, kernel: TexelKernel, directions: list,
 
 
 def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
-    """N times the variance, over the cell of a point, of what changes by ``d1``, ``d2`` per texel.
+    """N times the variance, over a point's cell, of a value with the gradient (``d1``, ``d2``) per
+    texel.
 
-    The cell has the kernel's own shape and the area 1/(N k): once the kernel is round, a variance
-    of area/12 along either axis.
+    The cell has the shape of the kernel and the area 1/(N k). Where the kernel is round, its
+    variance along each axis is a twelfth of the area.
     """
     if kernel.kernel == "box":
         return (dr.square(d1 * kernel.half_u) + dr.square(d2 * kernel.half_v)) / 3
@@ -689,45 +701,42 @@ def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
 #  Approximation by a smooth P-NDF (Eq. 13)
 # ------------------------------------------------------------------------------------------------
 
-#: Footprints that touch no more quads than this, by their kernel, see points of the kernel in place
-#: of the fit. A round Gaussian has a standard deviation of 1.2 texels then: smaller ones are no
-#: matter of averages over a texel or more. A disk or a box has one of 13 texels: their mean slope
-#: is not that of a Gaussian, by as much as makes 7 % of the energy at 5 texels.
+#: Footprints that touch at most this many quads use points of the kernel in place of the fit. For a
+#: round Gaussian this is a standard deviation of 1.2 texels; averages over a texel or more do not
+#: resolve smaller ones. For a disk or a box it is 13 texels, as their mean slope differs too much
+#: from the mean slope under a Gaussian.
 FINE_QUADS = {"gaussian": 64, "disk": 1600, "box": 1600}
 
 
 class GgxFit(FootprintArea):
     r"""P(ω) of the smooth distribution of slopes that fits the facets under a footprint.
 
-    The paper's Eq. 13, with the bracket that its print lost, is the area of a GGX distribution of
-    slopes around zero, ``P' = ½ (ω_z + √(ω_z² + ω_xyᵀ Ω ω_xy))``, with Ω fitted to P at grazing
-    angles. Facets under a footprint lean: around their mean slope s̄ it is that with
-    ``w̄ = ω_z + s̄·ω_xy`` in place of ω_z, for a distribution moved by s̄ sees ω_z moved by s̄·ω_xy
-    (Dupuy et al., "Linear Efficient Antialiased Displacement and Reflectance Mapping", 2013).
+    The paper's Eq. 13, whose print lost a bracket, is the projected area of a GGX distribution of
+    slopes around zero, ``P' = ½ (ω_z + √(ω_z² + ω_xyᵀ Ω ω_xy))``. The paper fits Ω to P at grazing
+    angles. The facets under a footprint have a mean slope s̄, so that ``w̄ = ω_z + s̄·ω_xy`` takes
+    the place of ω_z (Dupuy et al., "Linear Efficient Antialiased Displacement and Reflectance
+    Mapping", 2013).
 
-    Its tails are those of GGX slopes, which the slopes of a map have not: under a footprint of 3
-    texels on Gaussian bumps of slopes 0.15, facets reflect 3 % too little from 69°. And what is
-    fitted at the horizon says little of a footprint that leans away, where the facets that are seen
-    from above are not seen from the horizon: such places reflect up to 8 % more than they receive.
-    So Ω follows from the slopes' covariance, and the GGX form is used where the mean plane is seen
-    from behind; in front of it, that of a Gaussian (:func:`~.area_of_moments`).
+    Two things differ from the paper. The slopes of a map lack the long tails of GGX, with which
+    facets would reflect too little at grazing angles. And a fit at the horizon says little about a
+    footprint that leans away: facets that are visible from above are not visible from the horizon,
+    and such places would reflect more than they receive. So here Ω follows from the covariance of
+    slopes. The GGX form serves where the mean plane is seen from behind, and the area of a Gaussian
+    distribution where it is seen from the front (:func:`~.area_of_moments`).
 
-    Mean slope and covariance are averages over the footprint, taken by a :class:`~.MomentPyramid`:
-    levels are Gaussians of growing width, so a round footprint mixes the two next in size, and a
-    stretched one sums lookups along its axis. In place of the kernel stands the Gaussian with its
-    covariance (:func:`gaussian_like`).
+    Mean slope and covariance are averages over the footprint, by a :class:`~.MomentPyramid`. The
+    Gaussian with the kernel's covariance replaces the kernel (:func:`gaussian_like`). Small
+    footprints (:data:`FINE_QUADS`) use :func:`mean_over_points` instead.
 
-    Smaller footprints (:data:`FINE_QUADS`) see :func:`mean_over_points` instead.
-
-    Built in less time than a cache would take to read.
+    The pyramid is not cached on disk, as building it takes less time than reading it.
 
     Args:
         mesh (TexelMesh): the manifold. Derivatives flow through its ``data``.
-        domain (Domain): what will be asked for; None for anything. Levels that no such footprint
-            needs are left out.
+        domain (Domain): the queries to expect; None for any. Levels that none of them needs are
+            left out.
 
     Attributes:
-        pyramid (MomentPyramid): None where all footprints see :func:`mean_over_points`.
+        pyramid (MomentPyramid): None where all footprints use :func:`mean_over_points`.
     """
 
     def __init__(self, mesh: TexelMesh, domain: Domain | None = None) -> None:
@@ -741,7 +750,7 @@ class GgxFit(FootprintArea):
         return {f"masking, MIP levels {levels}": self.pyramid.nbytes}
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Average anew the data of the mesh."""
+        """Recompute the averages from the data of the mesh."""
         if keys and "data" not in keys:
             return
         self.pyramid, self.jumps = None, has_degenerate_triangles(self.mesh)
@@ -762,8 +771,8 @@ class GgxFit(FootprintArea):
         by_points = mean_over_points(self.mesh, kernel, directions, active & fine, self.jumps)
         if self.pyramid is None:
             return by_points
-        alike = gaussian_like(kernel, query.footprint)
-        x, y, xx, yy, xy = self.pyramid.average(alike, active & ~fine)
+        gaussian = gaussian_like(kernel, query.footprint)
+        x, y, xx, yy, xy = self.pyramid.average(gaussian, active & ~fine)
         slope = mi.Vector2f(x, y)
         areas = [
             area_of_moments(slope_along(w, slope), variance_along(w, (xx, xy, yy)))
@@ -776,27 +785,23 @@ class GgxFit(FootprintArea):
 
 
 def gaussian_like(kernel: TexelKernel, footprint: Footprint) -> Footprint:
-    """The footprint whose whole Gaussian has the covariance of a kernel under ``footprint``.
+    """The Gaussian, without a cut, that has the covariance of a kernel under ``footprint``.
 
-    A disk of the Mahalanobis radius ρ has ρ²/4 of the Gaussian's covariance, a Gaussian cut there
-    1 − ½ ρ²/(exp(½ ρ²) − 1); a box has ρ²/3 of the variances along the axes, and none across.
+    The box has the footprint's variances along u and v, times its own, and no covariance.
     """
-    reach = REACH[kernel.kernel]
+    width = sqrt(VARIANCE[kernel.kernel])
     if kernel.kernel == "box":
-        share = reach / sqrt(3)
         u = dr.norm(mi.Vector2f(footprint.du.x, footprint.dv.x))
         v = dr.norm(mi.Vector2f(footprint.du.y, footprint.dv.y))
-        return Footprint(footprint.uv, mi.Vector2f(share * u, 0), mi.Vector2f(0, share * v))
-    half = 0.5 * reach**2
-    share = sqrt(0.5 * half) if kernel.kernel == "disk" else sqrt(1 - half / (exp(half) - 1))
-    return Footprint(footprint.uv, share * footprint.du, share * footprint.dv)
+        return Footprint(footprint.uv, mi.Vector2f(width * u, 0), mi.Vector2f(0, width * v))
+    return Footprint(footprint.uv, width * footprint.du, width * footprint.dv)
 
 
 def slopes_of_quad(normals, epsilon: float) -> list:
     """Mean and central second moments of the slopes of a quad's effective triangles.
 
-    ``normals``: n0…n3 at its corners. By the midpoints of the triangles' edges, as
-    :func:`~.midpoint_rule`.
+    ``normals``: n0…n3 at its corners. The midpoints of the triangles' edges have equal weights, as
+    in :func:`~.midpoint_rule`.
     """
     slopes = [
         slope_of(m)
@@ -812,7 +817,7 @@ def slopes_of_quad(normals, epsilon: float) -> list:
 
 
 class ProjectedAreaMasking(MeanPlaneMasking):
-    """Masking over the mean plane, by an estimate of P that it keeps (Wu24, section 4.3).
+    """Masking over the mean plane, by an estimate of P (Wu24, section 4.3), which it owns.
 
     Args:
         area (FootprintArea): the estimate.
@@ -831,7 +836,7 @@ class ProjectedAreaMasking(MeanPlaneMasking):
 
 
 def area(name: str, mesh: TexelMesh, domain: Domain | None) -> FootprintArea | None:
-    """The estimate of P that a masking of this name uses; None for one that uses none."""
+    """The estimate of P for the masking of this name; None for one without such an estimate."""
     if name == "ggx_fit":
         return GgxFit(mesh, domain)
     if name == "analytic":

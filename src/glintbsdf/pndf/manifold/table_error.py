@@ -1,15 +1,16 @@
-"""The error of tables of normals: its prediction, and how it is calibrated on the map.
+"""The error of tables of normals: its prediction, and its calibration on the map.
 
 Interpolation between the nodes gives a P-NDF under a kernel that differs a little from the
-footprint's. The relative L1 error is at most the L1 norm of that difference, whatever the map. It
-is smaller, the more independent places of the map show a normal under the footprint, since their
-errors average out. For rough maps of all kinds it is, for standard deviations σ₁, σ₂,
+footprint's. The relative L1 error is at most the L1 norm of this difference, whatever the map. It
+is smaller where many independent places of the map show a normal under the footprint, as their
+errors average out. For rough maps of all kinds, and a footprint with the standard deviations σ₁ and
+σ₂, the error is
 
     ½ (K(spacing / σ₁) + K(spacing / σ₂)) · g / (g + √(σ₁ σ₂)),
 
-where K is the norm, and g the *grain*: how far apart independent places are. g is taken from the
-errors themselves under round footprints of a few sizes, for every level and every kernel: their
-mean over some places plus a standard deviation, so that most places err less.
+where K is the norm, and g a *correlation length*: the distance of independent places. To find g,
+errors are measured under round footprints of a few sizes, for every level and every kernel. The
+mean over some places plus one standard deviation counts, so that the error of most places is less.
 """
 
 from __future__ import annotations
@@ -25,23 +26,25 @@ from glintbsdf.footprint.kernels import KERNELS, REACH, VARIANCE
 #: Largest share of a footprint's variance that the functions of the nodes may add.
 MAX_NARROWING = 0.6
 
-#: Spacings over standard deviations of the footprints at which grains are measured, over the
-#: largest that :data:`MAX_NARROWING` allows.
+#: Footprints under which errors are measured: the spacing of nodes over the footprint's standard
+#: deviation, relative to its largest value (:func:`largest_spacing`).
 KNOTS = {"gaussian": (0.45, 0.7, 0.95), "disk": (0.25, 0.55, 0.95), "box": (0.25, 0.55, 0.95)}
 
-#: Places at which grains are measured; at the first few, the finest level is compared with the map.
+#: Number of places at which errors are measured, and number of places at which the finest level is
+#: compared with the map.
 PLACES, PLACES_ON_MAP = 16, 6
 
-#: Number of bins in which grains are measured, about.
+#: Approximate number of bins in which errors are measured.
 CALIBRATION_BINS = 3000
 
 
 def kernel_error(kernel: str, x, mixed: bool = False):
-    """L1 norm of the difference of a kernel and its interpolation, K(x).
+    """K(x): the L1 norm of the difference of a kernel and its interpolation.
 
-    ``x``: spacing of the nodes over the kernel's standard deviation; ``mixed``: whether the nodes'
-    functions are mixtures of finer splines. Fitted to the norms, averaged over the nodes' places; a
-    kernel with an edge is known there to a fraction of the spacing only.
+    ``x`` is the spacing of the nodes over the kernel's standard deviation. ``mixed`` says whether
+    the nodes' functions are mixtures of finer splines. The formula is fitted to the norms, averaged
+    over positions of the nodes. The edge of a disk or a box is resolved to a fraction of the
+    spacing, so their norm is linear in ``x``.
     """
     if kernel != "gaussian":
         return 0.6 * x
@@ -50,51 +53,58 @@ def kernel_error(kernel: str, x, mixed: bool = False):
 
 
 def narrowing(variance: float, kernel: str = "gaussian") -> float:
-    """Variance to take off a footprint against what the functions of the nodes add, texels².
+    """Variance to subtract from a footprint's, texels², as the functions of the nodes add to it.
 
     ``variance`` (texels²): variance of the function of a node.
     """
     return variance / VARIANCE[kernel]
 
 
-def widest(kernel: str) -> float:
-    """The largest spacing of nodes over the standard deviation of the footprint."""
+def largest_spacing(kernel: str) -> float:
+    """The largest spacing of nodes allowed, over the standard deviation of the footprint."""
     return sqrt(MAX_NARROWING * 4 * VARIANCE[kernel])
 
 
-def interpolated(grains, kernel: str, x):
-    """The grain at a spacing of ``x`` standard deviations from those at the knots."""
-    knots = [k * widest(kernel) for k in KNOTS[kernel]]
-    grain = grains[0]
+def interpolated(lengths, kernel: str, x):
+    """The correlation length for nodes that are ``x`` standard deviations apart, interpolated
+    between its values at the knots."""
+    knots = [k * largest_spacing(kernel) for k in KNOTS[kernel]]
+    length = lengths[0]
     for k in range(len(knots) - 1):
         part = (x - knots[k]) * (1 / (knots[k + 1] - knots[k]))
-        grain = grain + (grains[k + 1] - grains[k]) * dr.clip(part, 0, 1)
-    return grain
+        length = length + (lengths[k + 1] - lengths[k]) * dr.clip(part, 0, 1)
+    return length
 
 
-def fitted(kernel: str, grains, spacing: float, mixed: bool, minor, mean):
-    """Relative L1 error of a level for footprints, on average.
+def average_error(kernel: str, lengths, spacing: float, mixed: bool, minor, mean):
+    """Average relative L1 error of a level.
 
-    ``grains``: the level's for this kernel; ``spacing`` (texels) of its nodes, ``mixed`` as in
-    :func:`kernel_error`; ``minor``, ``mean`` (texels): standard deviation along the minor axis, and
-    geometric mean of both.
+    Args:
+        kernel (str): name of the footprint's kernel.
+        lengths: correlation lengths of the level for this kernel, at the knots, texels.
+        spacing (float): distance of the level's nodes, texels.
+        mixed (bool): as in :func:`kernel_error`.
+        minor: standard deviation of the footprint along its minor axis, texels.
+        mean: geometric mean of its standard deviations along both axes, texels.
     """
     across = kernel_error(kernel, spacing / minor, mixed)
     along = kernel_error(kernel, spacing * minor / (mean * mean), mixed)
-    grain = interpolated(grains, kernel, spacing / mean)
-    return 0.5 * (across + along) * grain / (grain + mean)
+    length = interpolated(lengths, kernel, spacing / mean)
+    return 0.5 * (across + along) * length / (length + mean)
 
 
-def predicted(kernel: str, grains, spacing: float, mixed: bool, minor, mean):
-    """As :func:`fitted`, with a margin, so that measured errors are below."""
-    return margin(kernel, spacing / mean) * fitted(kernel, grains, spacing, mixed, minor, mean)
+def predicted_error(kernel: str, lengths, spacing: float, mixed: bool, minor, mean):
+    """As :func:`average_error`, with a margin, so that measured errors are smaller."""
+    return margin(kernel, spacing / mean) * average_error(
+        kernel, lengths, spacing, mixed, minor, mean
+    )
 
 
 def margin(kernel: str, x):
-    """How far the prediction stays above the fit; ``x`` as for :func:`kernel_error`.
+    """Factor from the average error to the predicted one; ``x`` as in :func:`kernel_error`.
 
-    It is largest where the nodes of a level are close: there the errors are below one per cent, and
-    the fit is up to a fifth too low.
+    It is largest where nodes are close. There the errors are below one per cent, and
+    :func:`average_error` is up to a fifth too low.
     """
     return 1.06 + 0.5 * dr.clip(1.3 - x, 0, 0.4) if kernel == "gaussian" else 1.15
 
@@ -105,12 +115,14 @@ def margin(kernel: str, x):
 
 
 def cases() -> Iterator[tuple[str, float]]:
-    """The kernels, and spacings over standard deviations, at which errors are measured."""
-    return ((kernel, knot * widest(kernel)) for kernel in KERNELS for knot in KNOTS[kernel])
+    """Pairs (kernel, spacing of nodes over standard deviation) for which errors are measured."""
+    return (
+        (kernel, knot * largest_spacing(kernel)) for kernel in KERNELS for knot in KNOTS[kernel]
+    )
 
 
 def weights(kernel: str, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A kernel at offsets in standard deviations, with a sum of 1."""
+    """Values of a kernel at offsets (standard deviations), normalised to a sum of 1."""
     if kernel == "box":
         inside = np.maximum(np.abs(y), np.abs(x)) <= REACH[kernel]
     else:
@@ -121,7 +133,7 @@ def weights(kernel: str, y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def lattice(mean, half: float, spacing) -> tuple[np.ndarray, np.ndarray]:
-    """The points (y, x) of a lattice with centres of cells within ``half`` of ``mean``, texels."""
+    """Cells (y, x) of a lattice whose centres lie within ``half`` of ``mean``, both in texels."""
     axes = (
         np.arange(int(np.floor((m - half) / s)), int(np.ceil((m + half) / s)) + 1)
         for m, s in zip(mean, spacing, strict=True)
@@ -129,14 +141,14 @@ def lattice(mean, half: float, spacing) -> tuple[np.ndarray, np.ndarray]:
     return tuple(v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
 
 
-def true_masses(places, spacing: float, spread, bins: np.ndarray) -> np.ndarray:
-    """Masses in bins under round footprints, from the map: (places × cases, bins)."""
+def true_masses(places, spacing: float, rasterize, bins: np.ndarray) -> np.ndarray:
+    """Masses in bins under round footprints, computed from the map: (places × cases, bins)."""
     sigmas = [spacing / x for _, x in cases()]
     half = max(REACH[kernel] * s for (kernel, _), s in zip(cases(), sigmas, strict=True))
     found = []
     for mean in places:
         y, x = lattice(mean, half, (1, 1))
-        normals = spread(y, x)
+        normals = rasterize(y, x)
         for (kernel, _), sigma in zip(cases(), sigmas, strict=True):
             weight = weights(kernel, (y + 0.5 - mean[0]) / sigma, (x + 0.5 - mean[1]) / sigma)
             found.append((normals.T @ weight)[bins])
@@ -144,9 +156,12 @@ def true_masses(places, spacing: float, spread, bins: np.ndarray) -> np.ndarray:
 
 
 def table_masses(places, spacing: float, periods, count, variances, masses) -> np.ndarray:
-    """The same from a level of ``count`` nodes (y, x) with the ``masses`` (nodes, bins).
+    """Masses in bins under round footprints, computed from a level: (places × cases, bins).
 
-    ``variances`` (y, x; texels²): variances of the functions of its nodes.
+    Args:
+        count: number of nodes (y, x) of the level.
+        variances: variances (y, x) of the functions of its nodes, texels².
+        masses: masses (nodes, bins) of the level.
     """
     from scipy.sparse import csr_matrix
 
@@ -171,19 +186,23 @@ def table_masses(places, spacing: float, periods, count, variances, masses) -> n
     return matrix @ masses / np.float32(np.prod(spacings))
 
 
-def grains(periods, counts, variances, mixed, levels, spread, bins: np.ndarray) -> np.ndarray:
-    """The grains of all levels, texels: (levels, kernels, knots).
+def correlation_lengths(
+    periods, counts, variances, mixed, levels, rasterize, bins: np.ndarray
+) -> np.ndarray:
+    """The correlation lengths of all levels, texels: (levels, kernels, knots).
 
-    The finest level is compared with the map, the others with one about three times finer, whose
-    own error counts as independent.
+    The finest level is compared with the map. Any other level is compared with one about three
+    times finer, whose own error counts as independent.
 
     Args:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
         variances (list of pairs): variances of the nodes' functions, texels², for every level.
-        mixed (list of bools): whether these are mixtures of finer splines.
+        mixed (list of bools): for every level, whether these functions are mixtures of finer
+            splines.
         levels (list of arrays): masses (nodes, bins) of every level in ``bins``.
-        spread: ``spread(row, column)`` returns the matrix (quads, all bins).
+        rasterize: function ``(row, column)`` that returns the matrix (quads, all bins).
+        bins: indices of the bins in which errors are measured.
     """
     places = np.random.default_rng(0).random((PLACES, 2)) * periods
     spacings = [max(p / n for p, n in zip(periods, count, strict=True)) for count in counts]
@@ -198,18 +217,18 @@ def grains(periods, counts, variances, mixed, levels, spread, bins: np.ndarray) 
         where = here, spacing, periods
         table = table_masses(*where, counts[level], variances[level], levels[level])
         if level == 0:
-            truth = true_masses(here, spacing, spread, bins)
+            truth = true_masses(here, spacing, rasterize, bins)
         else:
             truth = table_masses(*where, counts[finer], variances[finer], levels[finer])
         errors = np.abs(table - truth).sum(1) / truth.sum(1)
         errors = errors.reshape(len(here), *found.shape[1:])
-        errors = errors.mean(0) + errors.std(0)  # places differ: most are to be below
+        errors = errors.mean(0) + errors.std(0)  # most places have a smaller error
         for k, (kernel, x) in enumerate(cases()):
             which, sigma = divmod(k, knots), spacing / x
             error = errors[which]
             if level > 0:
                 reference = found[finer, which[0]], spacings[finer], mixed[finer]
-                error = np.hypot(error, fitted(kernel, *reference, sigma, sigma))
+                error = np.hypot(error, average_error(kernel, *reference, sigma, sigma))
             share = min(error / kernel_error(kernel, x, mixed[level]), 0.99)
             found[level][which] = sigma * share / (1 - share)
     return found

@@ -1,15 +1,15 @@
 """Tables of the normals around the nodes of a lattice: how they are built and stored.
 
-The nodes of a level are P/n texels apart along an axis of period P, at (k + ½) P/n. Node k stands
-for the texels under a quadratic B-spline of that spacing, three spacings wide; the splines of all
-nodes add up to one. For every node, a table tells how the mass under its spline spreads over a
-grid of bins in the plane of projected normals, M_k(bin). As a spline is a sum of splines f times
-finer, for any whole f, the tables of the coarse levels are sums of those of the finest. Between the
-finest level and the one twice as coarse stands another, 1½ times as coarse, whose nodes have
-mixtures of the finest splines in place of splines of their own.
+Along an axis of period P, a level has n nodes, at (k + ½) P/n texels. Node k stands for the texels
+under a quadratic B-spline, which is three spacings P/n wide. The splines of all nodes add up to
+one. For every node there is a histogram M_k(bin) of the normals under its spline, over a grid of
+bins in the plane of projected normals. A spline is a sum of splines that are f times finer, for any
+whole f. So the tables of coarse levels are sums of tables of the finest level. Between the finest
+level and the level twice as coarse there is one that is 1½ times as coarse. Its nodes have mixtures
+of the finest splines in place of splines.
 
-Most of a table is zero, at rare normals above all. Per bin, 4×4 nodes share one word: which of them
-have an entry, and how many entries come before.
+Most entries of a table are zero, above all for rare normals. In each bin, 4×4 nodes share one word.
+It says which of the nodes have an entry, and how many entries come before.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from glintbsdf.core.progress import progress
 from glintbsdf.core.tuning import usable_cores
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.pndf.manifold import table_error
-from glintbsdf.pndf.manifold.table_error import grains
+from glintbsdf.pndf.manifold.table_error import correlation_lengths
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -35,32 +35,32 @@ if TYPE_CHECKING:
 #: Bins along each axis of the rectangle of the map's normals.
 BINS = 128
 
-#: Smallest bins, in units of projected normals: a twentieth of the sun's radius as half vectors see
-#: it. The normals of brushed metal are as narrow as 128 of them.
+#: Smallest size of a bin, in units of projected normals: a twentieth of the radius of the sun's
+#: half vectors.
 MIN_BIN = 1e-4
 
-#: Memory allowed for the finest level, bytes. All levels together take up to 3 times as much.
+#: Memory allowed to the finest level, bytes. All levels together take up to 3 times as much.
 BYTES = 64 << 20
 
-#: Share of this memory that is planned for: an estimate from a sample may be up to 15 % too low.
+#: Share of this memory to plan for, as the estimate from a sample may be too low.
 PLANNED = 0.9
 
-#: Smallest distance of nodes, texels. Below, the exact lists are as fast.
+#: Smallest distance of nodes, texels. Where it would be smaller, the exact lists are as fast.
 MIN_SPACING = 8
 
-#: Nodes of a level, at most: 16 bits count the entries of a bin.
+#: Largest number of nodes of a level: 16 bits count the entries of a bin.
 MAX_NODES = (1 << 16) - 1
 
 #: Side of the square of nodes that share a word.
 TILE = 4
 
-#: Entries of the map's sparse matrix of quads and bins that are held at once.
+#: Number of entries of the sparse matrix (quads, bins) of the map that are in memory at a time.
 STRIP_ENTRIES = 8e6
 
-#: Masses (nodes × bins) of the finest level that are held at once as a full array, by each thread.
+#: Number of masses (nodes × bins) of the finest level that each thread has in a dense array.
 CHUNK = 1 << 19
 
-#: Threads for what NumPy and SciPy do.
+#: Number of threads for the work of NumPy and SciPy.
 THREADS = usable_cores()
 
 
@@ -70,14 +70,14 @@ THREADS = usable_cores()
 
 
 def spline_integral(t: np.ndarray) -> np.ndarray:
-    """∫ from −∞ to ``t`` of the quadratic B-spline on [−3/2, 3/2], of unit spacing."""
+    """∫ from −∞ to ``t`` of the quadratic B-spline of unit spacing, on [−3/2, 3/2]."""
     t = np.clip(t, -1.5, 1.5)
     middle = 0.5 + t * (0.75 - t * t / 3)
     return np.where(t < -0.5, (1.5 + t) ** 3 / 6, np.where(t > 0.5, 1 - (1.5 - t) ** 3 / 6, middle))
 
 
-def shares(period: int, count: int) -> csr_matrix:
-    """Mean of every node's spline over every quad of an axis, (``count``, ``period``)."""
+def spline_weights(period: int, count: int) -> csr_matrix:
+    """Mean of every node's spline over every quad along an axis, (``count``, ``period``)."""
     from scipy.sparse import csr_matrix
 
     spacing = period / count
@@ -89,7 +89,7 @@ def shares(period: int, count: int) -> csr_matrix:
 
 
 def count_near(wanted: float) -> int:
-    """The largest number of nodes ≤ ``wanted``, at least 1, that has many divisors."""
+    """The largest number ≤ ``wanted``, but at least 1, that has many divisors."""
     many = (m << k for m in (3, 9, 15, 21) for k in range(1, 17))
     return max((n for n in (1, 2, 3, 4, *many) if n <= wanted), default=1)
 
@@ -97,7 +97,7 @@ def count_near(wanted: float) -> int:
 def axis_counts(count: int) -> list[int]:
     """Nodes along an axis of levels 1, 1½, 2, 3, 4, 6, 8, … times coarser than ``count``.
 
-    All but the second divide ``count``, so that a level may be somewhat coarser than that.
+    All numbers but the second divide ``count``, so a level may be somewhat coarser than that.
     """
     divisors = [n for n in range(1, count + 1) if count % n == 0]
     counts = [count, 2 * count // 3 if count % 6 == 0 else count]
@@ -115,12 +115,13 @@ def level_counts(count: tuple[int, int]) -> list[tuple[int, int]]:
     return sorted(set(zip(y, x, strict=True)), reverse=True)
 
 
-def weights_of(finer: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The splines of ``count`` nodes as sums of those of ``finer``: ``(finer nodes, weights)``.
+def refinement_weights(finer: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The functions of ``count`` nodes as sums of splines of ``finer`` nodes.
 
-    Both are (``count``, K). Where ``count`` divides ``finer``, a coarse spline is a sum of fine
-    ones. Two thirds as many nodes have a function about as wide as the spline: the closest one with
-    positive weights that add up to one for every fine spline and keep the mean.
+    Returns ``(finer nodes, weights)``, both (``count``, K). Where ``count`` divides ``finer``, a
+    coarse spline is exactly a sum of fine ones. Where ``count`` is two thirds of ``finer``, the
+    function is the closest one to the coarse spline that has positive weights, keeps the mean, and
+    whose weights add up to one for every fine spline.
     """
     node = np.arange(count)[:, None]
     if 3 * count == 2 * finer:
@@ -136,13 +137,13 @@ def weights_of(finer: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     return place % finer, np.broadcast_to(weights, place.shape)
 
 
-#: Weights of the fine splines in a function 1½ times as wide, the nearest to its centre but one on
-#: the left, the nearest, and the one on the right (of odd nodes, mirrored).
+#: Weights of three fine splines in a function 1½ times as wide: the one to the left of the spline
+#: nearest to its centre, the nearest, and the one to the right. For odd nodes they are mirrored.
 TWO_THIRDS = (1 / 8, 7 / 8, 1 / 2)
 
 
-def spread_variance(count: int, finest: int) -> float:
-    """Variance of the function of a node, in units of the squared distance of its level's nodes."""
+def spline_variance(count: int, finest: int) -> float:
+    """Variance of the function of a node, in units of the squared spacing of its level."""
     if 3 * count == 2 * finest:
         left, _, right = (w / 1.5 for w in TWO_THIRDS)
         return (0.25 + left + right - (right - left) ** 2) / 1.5**2
@@ -152,7 +153,7 @@ def spread_variance(count: int, finest: int) -> float:
 def variances_of(periods, count, finest) -> tuple[float, float]:
     """Variance (y, x), texels², of the functions of the nodes of a level of ``count`` nodes."""
     return tuple(
-        spread_variance(n, f) * (p / n) ** 2 for p, n, f in zip(periods, count, finest, strict=True)
+        spline_variance(n, f) * (p / n) ** 2 for p, n, f in zip(periods, count, finest, strict=True)
     )
 
 
@@ -162,25 +163,27 @@ def mixed_levels(counts) -> list[bool]:
 
 
 def refinement(finer: int, count: int) -> csr_matrix:
-    """The functions of ``count`` nodes in terms of those of ``finer``: (``count``, ``finer``)."""
+    """Matrix (``count``, ``finer``) that expresses functions of ``count`` nodes by finer
+    splines."""
     from scipy.sparse import csr_matrix, identity
 
     if finer == count:
         return identity(count, np.float32, "csr")
-    places, weights = weights_of(finer, count)
+    places, weights = refinement_weights(finer, count)
     begin = np.arange(count + 1) * places.shape[1]
     return csr_matrix((weights.ravel().astype(np.float32), places.ravel(), begin), (count, finer))
 
 
 def refinements(counts) -> list[tuple[int, csr_matrix]]:
-    """For all levels but the first: a finer one, and the matrix (nodes, its nodes) to sum it up."""
+    """For all levels but the first: a finer level, and the matrix (nodes, finer nodes) that sums
+    its tables."""
     from scipy.sparse import kron
 
     found = []
     for level, count in enumerate(counts[1:], 1):
 
         def fits(finer, count=count):
-            """Whether splines of this level, along both axes, are what the level is made of."""
+            """Whether ``level`` is a sum of tables of the level ``finer``, along both axes."""
             axes = zip(counts[finer], count, counts[0], strict=True)
             return all(p in (n, f) or p % n == f % p == 0 for p, n, f in axes)
 
@@ -198,8 +201,8 @@ def refinements(counts) -> list[tuple[int, csr_matrix]]:
 def clipped_area(corners, x, y):
     """Area of a triangle inside the unit square at (``x``, ``y``), ≥ 0.
 
-    By Green's theorem: every edge adds the integral over its height in the square's rows of its
-    abscissa clamped to the square's columns; the square's own edges then add nothing.
+    By Green's theorem: every edge is cut to the heights of the square, and adds the integral over
+    its height of x clamped to the square. The edges of the square then add nothing.
     """
     origin = mi.Vector2f(x, y)
     corners = [corner - origin for corner in corners]
@@ -207,7 +210,7 @@ def clipped_area(corners, x, y):
     for p, q in zip(corners, corners[1:] + corners[:1], strict=True):
         start, end, from_x, to_x = within_row(p, q)
         run = to_x - from_x
-        # Mean over the edge of its abscissa clamped to [0, 1]: ∫ clamp = ½ c² + max(x − 1, 0).
+        # Mean over the edge of x clamped to [0, 1]: ∫ clamp(x) dx = ½ clamp(x)² + max(x − 1, 0).
         middle = dr.clip(0.5 * (from_x + to_x), 0, 1)
         first, last = (
             0.5 * dr.square(dr.clip(v, 0, 1)) + dr.maximum(v - 1, 0) for v in (from_x, to_x)
@@ -219,7 +222,7 @@ def clipped_area(corners, x, y):
 
 
 def within_row(p, q):
-    """The part of an edge between the ordinates 0 and 1: its ordinates, and its abscissas."""
+    """The part of an edge from p to q with y in [0, 1]: y at both its ends, and x at both."""
     rise = q.y - p.y
     slope = (q.x - p.x) / dr.select(dr.abs(rise) > 1e-9, rise, 1)
     start, end = dr.clip(p.y, 0, 1), dr.clip(q.y, 0, 1)
@@ -239,7 +242,7 @@ class Bins:
         self.size = np.maximum((upper - self.lower) / BINS, MIN_BIN)
         shape = np.maximum(np.ceil((upper - self.lower) / self.size - 1e-6), 1)
         self.columns, self.rows = (int(n) for n in shape)
-        # For kernels, which are the same for all maps.
+        # Opaque values: one kernel serves all maps.
         self.corner, self.extent, self.per_size = (
             mi.Vector2f(*(opaque(mi.Float, float(x)) for x in values))
             for values in (self.lower, self.size, 1 / self.size)
@@ -264,23 +267,23 @@ class Bins:
         return y * self.shape.x + x, inside
 
     def normal(self, index, jitter):
-        """The projected normal at a place ``jitter`` ∈ [0, 1)² in a bin."""
-        # No whole number is divided by a variable: of lanes that call another BSDF it is 0, and the
-        # processor would end the program.
+        """The projected normal at the position ``jitter`` ∈ [0, 1)² in a bin."""
+        # Not an integer division by a variable: the variable is 0 in lanes that call another BSDF,
+        # and the processor would stop the program.
         row = mi.UInt32((mi.Float(index) + 0.5) * self.per_row)
         place = mi.Vector2f(mi.Float(index - row * self.shape.x), mi.Float(row))
         return self.corner + self.extent * (place + jitter)
 
-    def spread(self, triangles, row: np.ndarray, column: np.ndarray) -> csr_matrix:
-        """How the normals of quads spread over the bins: (quads, bins), every row of sum 1.
+    def rasterize(self, triangles, row: np.ndarray, column: np.ndarray) -> csr_matrix:
+        """The share of each quad's normals in each bin: (quads, bins), where every row sums to 1.
 
-        ``row``, ``column`` (N): stored quads; ``triangles(row, column, active)`` returns the two
-        triangles of each, as a vertex and two edges (``mi.Vector2f``) over which half of the quad
-        is spread evenly.
+        ``row``, ``column`` (N) are stored quads. ``triangles(row, column, active)`` returns the two
+        normal triangles of a quad, each as a vertex and two edges (``mi.Vector2f``). Each triangle
+        has half of the quad's normals, uniformly over its area.
         """
         from scipy.sparse import csr_matrix
 
-        # The triangles of a quad in turn.
+        # Two lanes per quad, one for each triangle.
         lane = dr.arange(mi.UInt32, 2 * len(row))
         row, column = (dr.gather(mi.Int, mi.Int(v), lane >> 1) for v in (row, column))
         (a, *first), (b, *second) = triangles(row, column, mi.Bool(True))
@@ -324,9 +327,9 @@ class Bins:
         dr.eval(total, part, bins)
 
         part, total, counted, begin = (v.numpy() for v in (part, total, counted, begin))
-        for lost in np.flatnonzero(total == 0):  # to rounding: triangles of next to no area
-            part[begin[lost] : begin[lost] + counted[lost]] = 1
-            total[lost] = counted[lost]
+        for empty in np.flatnonzero(total == 0):  # triangles whose area is lost to rounding
+            part[begin[empty] : begin[empty] + counted[empty]] = 1
+            total[empty] = counted[empty]
         part *= np.repeat(np.float32(0.5) / total, counted)
         first = np.append(begin[::2], entries).astype(np.int32)
         return csr_matrix((part, bins.numpy(), first), (len(first) - 1, self.rows * self.columns))
@@ -356,21 +359,24 @@ class Bins:
 
 
 class NormalTables:
-    """The tables of all levels, around the arrays that :meth:`build` makes.
+    """The tables of all levels, on the device.
 
-    Arrays (NumPy), with L levels and F bins that any normal falls into:
-        ``bounds`` (2, 2): the rectangle of normals; ``counts`` (L, 2): nodes (y, x);
-        ``rows``: number of a bin among the F, or ``EMPTY``;
-        ``words``: per level, bin and tile, which of its nodes have an entry (16 bits), and the
-        number of entries of the bin in tiles before (16 bits);
-        ``starts`` (L, F): first entry of a bin;
-        ``entries``: M_k(bin) per texel² as half floats times 2¹⁵, over the area of a node;
-        ``grains`` (L, kernels, knots): see :func:`~.grains`.
+    They are made of the arrays (NumPy) that :meth:`build` returns. With L levels and F bins that
+    are not empty, these are
+
+    * ``bounds`` (2, 2): the rectangle of normals;
+    * ``counts`` (L, 2): number of nodes (y, x);
+    * ``rows``: for every bin its index among the F, or ``EMPTY``;
+    * ``words``: for every level, bin and tile, which of the tile's nodes have an entry (16 bits),
+      and the number of the bin's entries in the tiles before (16 bits);
+    * ``starts`` (L, F): index of the first entry of a bin;
+    * ``entries``: M_k(bin) in texels², over the area of a node, as half floats times 2¹⁵;
+    * ``correlation_lengths`` (L, kernels, knots): see :func:`~.correlation_lengths`.
 
     Attributes:
         periods (pair of ints): quads along y and x.
         counts (list of pairs): nodes (y, x) of every level.
-        grains (nested lists): grains of every level, kernel and knot, texels.
+        correlation_lengths (nested lists): for every level, kernel and knot, texels.
         mixed (list of bools): whether the functions of the nodes are mixtures of finer splines.
         variances (list of pairs): variances (y, x) of the functions of every level's nodes,
             texels².
@@ -382,7 +388,7 @@ class NormalTables:
     def __init__(self, arrays: dict[str, np.ndarray], periods: tuple[int, int]) -> None:
         self.bins, self.periods = Bins(arrays["bounds"]), periods
         self.counts = [tuple(int(n) for n in count) for count in arrays["counts"]]
-        self.grains = arrays["grains"].tolist()
+        self.correlation_lengths = arrays["correlation_lengths"].tolist()
         self.mixed = mixed_levels(self.counts)
         self.variances = [variances_of(periods, count, self.counts[0]) for count in self.counts]
         self.rows = mi.UInt32(arrays["rows"])
@@ -395,9 +401,9 @@ class NormalTables:
         self.nbytes = sum(self.level_nbytes) + arrays["rows"].nbytes
         self.filled = filled
         self.count_y, self.count_x = (mi.Int(v) for v in zip(*self.counts, strict=True))
-        # In units of the squared distance of nodes.
+        # In units of the squared spacing of nodes.
         self.variance_y, self.variance_x = (
-            mi.Float([spread_variance(n, axis[0]) for n in axis])
+            mi.Float([spline_variance(n, axis[0]) for n in axis])
             for axis in zip(*self.counts, strict=True)
         )
         self.first_word = mi.UInt32(np.cumsum([0, *tiles])[:-1])
@@ -412,17 +418,17 @@ class NormalTables:
         return len(self.counts)
 
     def spacing(self, level: int) -> float:
-        """Distance of neighbouring nodes, texels, along the axis where it is larger."""
+        """Spacing of a level's nodes, texels; the larger one of both axes."""
         return max(p / n for p, n in zip(self.periods, self.counts[level], strict=True))
 
     def row(self, m, active=True):
-        """The number of the bin of ``m`` among the filled ones, and whether it is one."""
+        """The index of the bin of ``m`` among the filled bins, and whether it is one of them."""
         index, inside = self.bins.index(m)
         row = dr.gather(mi.UInt32, self.rows, index, active & inside)
         return row, active & inside & (row != self.EMPTY)
 
     def table(self, level, row, active):
-        """Where the table of a bin is stored, to be handed to :meth:`value`."""
+        """The position in memory of the table of a bin, an argument of :meth:`value`."""
         count_y, count_x = (dr.gather(mi.Int, n, level) for n in (self.count_y, self.count_x))
         tiles_y, tiles_x = ((mi.UInt32(n) + (TILE - 1)) // TILE for n in (count_y, count_x))
         word = dr.gather(mi.UInt32, self.first_word, level) + row * tiles_y * tiles_x
@@ -442,7 +448,7 @@ class NormalTables:
         found = active & ((word & bit) != 0)
         pair = dr.gather(mi.UInt32, self.entries, index >> 1, found)
         half = dr.select(found, (pair >> ((index & 1) << 4)) & 0x7FFF, 0)
-        # A half float's exponent is 112 less than a float's; times the 2¹⁵ of storage.
+        # The exponent of a half float is 112 less than that of a float; entries are times 2¹⁵.
         return dr.reinterpret_array(mi.Float, half << 13) * 2.0 ** (112 - 15)
 
     # --------------------------------------------------------------------------------------------
@@ -451,22 +457,22 @@ class NormalTables:
 
     @classmethod
     def build(cls, lattice, triangles, bounds) -> dict[str, np.ndarray]:
-        """Condense a lattice to tables.
+        """Build the arrays of the tables of a lattice.
 
         ``triangles(row, column, active)`` returns the two triangles of a stored quad, each as a
-        vertex and two edges (``mi.Vector2f``); ``bounds`` (lower, upper): the rectangle of
-        projected normals in which they lie.
+        vertex and two edges (``mi.Vector2f``). ``bounds`` (lower, upper) is the rectangle of
+        projected normals that holds all triangles.
         """
         periods = (lattice.y.quads, lattice.x.quads)
         bins = Bins(bounds)
 
-        def spread(row, column):
-            return bins.spread(triangles, row % periods[0], column % periods[1])
+        def rasterize(row, column):
+            return bins.rasterize(triangles, row % periods[0], column % periods[1])
 
-        count, per_quad = affordable(periods, bins, spread)
+        count, per_quad = affordable(periods, bins, rasterize)
         with progress("Building tables of normals") as report:
             while True:
-                finest = masses(periods, count, spread, per_quad, report)
+                finest = masses(periods, count, rasterize, per_quad, report)
                 filled = np.flatnonzero(np.bincount(finest.indices, minlength=finest.shape[1]))
                 if 2 * finest.nnz + 4 * len(filled) * (np.prod(tiles_of(count)) + 1) <= BYTES:
                     break
@@ -475,7 +481,7 @@ class NormalTables:
         finest, coarser = without_empty_rows(finest.T.tocsr(), filled), refinements(counts)
 
         def all_levels(bins):
-            """Masses of all levels in a few of the filled bins: (nodes, bins)."""
+            """Masses of all levels in some of the filled bins: (nodes, bins)."""
             levels = [finest[bins].toarray(order="F").T]
             for nearest, matrix in coarser:
                 levels.append(matrix @ levels[nearest])
@@ -507,17 +513,20 @@ class NormalTables:
             "words": np.concatenate([w.ravel() for w in words]),
             "starts": (ends - np.concatenate(lengths)).astype(np.uint32).reshape(len(counts), -1),
             "entries": np.concatenate(entries),
-            "grains": grains(periods, counts, *functions, all_levels(some), spread, filled[some]),
+            "correlation_lengths": correlation_lengths(
+                periods, counts, *functions, all_levels(some), rasterize, filled[some]
+            ),
         }
 
 
 def tiles_of(count: tuple[int, int]) -> tuple[int, int]:
-    """Tiles (y, x) for so many nodes."""
+    """Number of tiles (y, x) for a number of nodes (y, x)."""
     return tuple(-(-n // TILE) for n in count)
 
 
-def affordable(periods, bins: Bins, spread) -> tuple[tuple[int, int], float]:
-    """Nodes (y, x) of the finest level that :data:`BYTES` hold, and entries of the map per quad.
+def affordable(periods, bins: Bins, rasterize) -> tuple[tuple[int, int], float]:
+    """Number of nodes (y, x) of the finest level whose tables fit in :data:`BYTES`, and the mean
+    number of bins that a quad touches.
 
     The bins under splines of a few sizes are counted in windows of the map.
     """
@@ -527,7 +536,7 @@ def affordable(periods, bins: Bins, spread) -> tuple[tuple[int, int], float]:
     y, x = (v.ravel() for v in np.indices(sides))
     row = (rng.integers(periods[0], size=(windows, 1)) + y).ravel()
     column = (rng.integers(periods[1], size=(windows, 1)) + x).ravel()
-    normals = spread(row, column)
+    normals = rasterize(row, column)
     spacings = np.array([4, 6, 8, 11, 16])
     counted = []
     for spacing in spacings:
@@ -539,7 +548,7 @@ def affordable(periods, bins: Bins, spread) -> tuple[tuple[int, int], float]:
         ]
         counted.append(np.mean(found))
     most = len(np.unique(normals.indices))
-    # As a power of the spacing, between the sizes counted and beyond them.
+    # The number of bins is interpolated, and extrapolated, as a power of the spacing.
     logs = np.log(spacings), np.log(counted)
     slope = (logs[1][-1] - logs[1][-2]) / (logs[0][-1] - logs[0][-2])
 
@@ -556,11 +565,11 @@ def affordable(periods, bins: Bins, spread) -> tuple[tuple[int, int], float]:
         spacing *= 1.02
 
 
-def masses(periods, count, spread, per_quad: float, report) -> csr_matrix:
-    """Mass under the splines of nodes, texels²: (nodes, bins), the nodes row by row."""
+def masses(periods, count, rasterize, per_quad: float, report) -> csr_matrix:
+    """Masses M_k(bin) under the splines of nodes, texels²: (nodes, bins), nodes row by row."""
     from scipy.sparse import kron, vstack
 
-    of_y, of_x = (shares(p, n) for p, n in zip(periods, count, strict=True))
+    of_y, of_x = (spline_weights(p, n) for p, n in zip(periods, count, strict=True))
     strips = np.array_split(
         np.arange(periods[0]), -(-int(per_quad * np.prod(periods)) // int(STRIP_ENTRIES))
     )
@@ -569,7 +578,7 @@ def masses(periods, count, spread, per_quad: float, report) -> csr_matrix:
         row, column = (v.ravel() for v in np.meshgrid(strip, np.arange(periods[1]), indexing="ij"))
         weights = of_y[:, strip]
         touched = np.flatnonzero(np.diff(weights.indptr))
-        normals = spread(row, column)
+        normals = rasterize(row, column)
 
         def sums(node, weights=weights, normals=normals):
             return kron(weights[node], of_x, format="csr") @ normals
@@ -584,7 +593,7 @@ def masses(periods, count, spread, per_quad: float, report) -> csr_matrix:
 
 
 def without_empty_rows(matrix: csr_matrix, filled: np.ndarray) -> csr_matrix:
-    """The rows ``filled`` of a matrix, whose other rows are empty; a view."""
+    """A view of the rows ``filled`` of a matrix, whose other rows must be empty."""
     from scipy.sparse import csr_matrix
 
     begin = np.append(matrix.indptr[filled], matrix.nnz)
@@ -592,9 +601,10 @@ def without_empty_rows(matrix: csr_matrix, filled: np.ndarray) -> csr_matrix:
 
 
 def pack(mass: np.ndarray, count, periods) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The words (bins, tiles) of a level, its numbers of entries (bins), and its entries.
+    """The words of a level (bins, tiles), its numbers of entries (bins), and its entries.
 
-    ``mass`` (nodes, bins): texels², of ``count`` (y, x) nodes. See :class:`NormalTables`.
+    ``mass`` (nodes, bins) are the masses of ``count`` (y, x) nodes, texels². See
+    :class:`NormalTables`.
     """
     tiles = tiles_of(count)
     padding = [(0, TILE * t - n) for t, n in zip(tiles, count, strict=True)]

@@ -1,21 +1,22 @@
-"""The manifold's P-NDF at a cost that does not grow with the footprint, to an error of choice.
+"""The manifold's P-NDF from tables: its cost does not grow with the footprint, its error is chosen.
 
-For large footprints the map is condensed to a lattice of nodes, B texels apart. Node k stands for
-the texels around it, weighed by a function φ_k, a quadratic B-spline or nearly so; the functions of
-all nodes add up to one. For every node a table tells how the mass under its function spreads over a
-grid of bins in the plane of projected normals, M_k(bin) (:mod:`~glintbsdf.pndf.manifold.tables`).
-Interpolating the footprint's kernel between the nodes gives
+For large footprints a lattice of nodes, B texels apart, replaces the map. Node k stands for the
+texels around it, weighted by a function φ_k, which is a quadratic B-spline or close to one. The
+functions of all nodes add up to one. For every node, a table holds the histogram M_k(bin) of the
+normals under φ_k (:mod:`~glintbsdf.pndf.manifold.tables`). With the footprint's kernel interpolated
+between the nodes,
 
     D(m) = Σ_k k(u_k − x) M_k(bin of m) / (B² Σ_k k(u_k − x) · area of a bin).
 
-A sample takes a node with probability ∝ k(u_k − x), a place with density φ_k, the normal there, and
-a place in that normal's bin: exactly this density, with no tables but M.
+The sampler draws a node in proportion to k(u_k − x), a position with the density φ_k, and a
+position in the bin of the normal there. This is exactly the density D, and needs no further tables.
 
-*The error.* φ_k widens the kernel by its own variance, B²/4 per axis for a spline, which is taken
-off the footprint's covariance beforehand; what is left is the difference of two kernels of equal
-mass, mean and covariance. How much of it shows depends on the map, and is measured when the tables
-are built (:mod:`~glintbsdf.pndf.manifold.table_error`). Levels have nodes 1⅓ to 1½ times as far
-apart as the one before, and a footprint uses the coarsest level whose predicted error is allowed.
+*The error.* φ_k adds its own variance to the kernel, B²/4 per axis for a spline. So the footprint
+is narrowed by this variance before. The remaining error is the difference of two kernels of equal
+mass, mean and covariance. Its effect depends on the map and is measured when the tables are built
+(:mod:`~glintbsdf.pndf.manifold.table_error`). The nodes of a level are 1⅓ to 1½ times as far apart
+as the nodes of the level before. A footprint uses the coarsest level whose predicted error is
+allowed.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.pndf.base import register
 from glintbsdf.pndf.manifold.exact import Manifold
 from glintbsdf.pndf.manifold.mesh import normal_in_quad
-from glintbsdf.pndf.manifold.table_error import MAX_NARROWING, predicted, widest
+from glintbsdf.pndf.manifold.table_error import MAX_NARROWING, largest_spacing, predicted_error
 from glintbsdf.pndf.manifold.tables import MIN_SPACING, TWO_THIRDS, NormalTables
 
 
@@ -50,20 +51,25 @@ from glintbsdf.pndf.manifold.tables import MIN_SPACING, TWO_THIRDS, NormalTables
     settings={"max_error": 0.05},
 )
 class TabulatedManifold(Manifold):
-    """The manifold, exact for small footprints, by tables beyond; arguments as for ``Manifold``.
+    """The manifold, exact for small footprints and by tables for large ones.
+
+    Other arguments are the same as in :class:`Manifold`.
 
     Args:
-        max_error (float): relative L1 error of the P-NDF allowed, > 0, on the bins of the tables:
-            1/128 of the range of the map's normals, at least 1e-4. Within a bin normals are spread
-            evenly: bins that lie otherwise differ by more. The error predicted stays below; the one
-            measured, averaged over three places, is 0.63 to 0.96 of it on six kinds of maps, 0.45
-            to 0.95 for kernels with an edge, up to 1.2 at a single place (``python -m benchmarks
-            manifold tables``). Footprints so small that it would be larger are evaluated exactly.
-        domain: as for :class:`Manifold`; there are no tables where all footprints are exact.
+        max_error (float): largest relative L1 error of the P-NDF, > 0. It is an error of the masses
+            in the bins of the tables, whose size is 1/128 of the range of the map's normals, and at
+            least 1e-4. Within a bin D is constant, so the error in finer or shifted bins is larger.
+            The predicted error is at most ``max_error``; ``python -m benchmarks manifold tables``
+            compares it with the measured one. Footprints for which no level is accurate enough are
+            evaluated exactly.
+        domain: as in :class:`Manifold`; there are no tables where all footprints are exact.
 
-    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. From exact to tables, and
-    from level to level, densities change by less than ``max_error`` at a size of the footprint:
-    there is no blending, which would cost both.
+    A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. There is no blending between
+    levels, which would cost twice as much: where a growing footprint goes from one level to the
+    next, D jumps by less than ``max_error``.
+
+    Raises:
+        ParameterError: an argument is out of range.
     """
 
     def __init__(
@@ -86,7 +92,7 @@ class TabulatedManifold(Manifold):
         super().__init__(normal_map, kernel, epsilon, owner, domain)
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make lists and tables for queries within ``domain``; the cache may know them."""
+        """Build lists and tables for queries within ``domain``, or load them from the cache."""
         super().build(domain)
         self.tables = None
         exact = self.stand_in is not None or self.normal_map.wrap_mode == "clamp"
@@ -98,35 +104,37 @@ class TabulatedManifold(Manifold):
 
     @property
     def known_tables(self) -> NormalTables:
-        """The tables, for what is asked only where there are any."""
+        """The tables; it is an error to use them where there are none."""
         if self.tables is None:
             raise RuntimeError(f"{self.owner}: no tables have been built")
         return self.tables
 
     def build_tables(self) -> dict[str, np.ndarray]:
-        """The arrays of the tables."""
+        """Build the arrays of the tables."""
         return NormalTables.build(self.lattice, self.effective_triangles, self.normal_bounds())
 
     def may_use_tables(self) -> bool:
-        """Whether any footprint within the domain has room for the closest nodes there could be."""
+        """Whether any footprint within the domain is wide enough for the smallest spacing of
+        nodes."""
         if self.domain is None:
             return True
         closest = min(MIN_SPACING, max(self.lattice.y.quads, self.lattice.x.quads))
-        return closest <= widest(self.kernel) * self.domain.largest
+        return closest <= largest_spacing(self.kernel) * self.domain.largest
 
     def error(self, kernel: TexelKernel, level: int) -> mi.Float:
         """The relative L1 error predicted for a footprint's kernel and a level of the tables."""
         mean = dr.sqrt(kernel.sigma_u_given_v * kernel.sigma_v)
         tables = self.known_tables
-        grains = tables.grains[level][KERNELS.index(self.kernel)]
-        nodes = [opaque(mi.Float, x) for x in grains], opaque(mi.Float, tables.spacing(level))
+        lengths = tables.correlation_lengths[level][KERNELS.index(self.kernel)]
+        nodes = [opaque(mi.Float, x) for x in lengths], opaque(mi.Float, tables.spacing(level))
         minor = dr.sqrt(kernel.minor_variance)
-        return predicted(self.kernel, *nodes, tables.mixed[level], minor, mean)
+        return predicted_error(self.kernel, *nodes, tables.mixed[level], minor, mean)
 
     def measured_error(self, footprint) -> float:
-        """The relative L1 error under a single footprint, over all bins: a slow check.
+        """The relative L1 error under a single footprint, over all bins; this is slow.
 
-        The truth spreads every triangle over the bins, weighed by the kernel at its quad's centre.
+        The reference rasterises all triangles into the bins, weighted by the kernel at the centre
+        of their quad.
         """
         kernel, bins = self.texel_kernel(Query.of(footprint)), self.known_tables.bins
         (mean,) = np.array(mi.Vector2f(kernel.mean)).T
@@ -137,21 +145,21 @@ class TabulatedManifold(Manifold):
         offset = mi.Vector2f(mi.Float(column), mi.Float(row)) + 0.5 - mi.Vector2f(*map(float, mean))
         weight = kernel.value(offset).numpy()
         touched, periods = weight > 0, self.known_tables.periods
-        spread = bins.spread(
+        part_in_bin = bins.rasterize(
             self.effective_triangles, row[touched] % periods[0], column[touched] % periods[1]
         )
-        truth = spread.T @ weight[touched].astype(np.float64)
+        truth = part_in_bin.T @ weight[touched].astype(np.float64)
         every_bin = bins.normal(dr.arange(mi.UInt32, len(truth)), mi.Vector2f(0.5))
         masses = self.eval(every_bin, footprint).numpy().astype(np.float64) * bins.area
         return float(np.abs(masses - truth / truth.sum()).sum())
 
     def level(self, query: Query | Footprint) -> mi.Int:
-        """The coarsest level of nodes that keeps the error, −1 where none does."""
+        """The coarsest level whose predicted error is allowed; −1 where there is none."""
         query = Query.of(query)
         return query.once((self, "level"), lambda: self.find_level(self.texel_kernel(query)))
 
     def find_level(self, kernel: TexelKernel) -> mi.Int:
-        """The level for a kernel, see :meth:`level`."""
+        """Compute what :meth:`level` returns, for a kernel."""
         level = mi.Int(-1)
         for k, variances in enumerate(self.known_tables.variances):
             variance = opaque(mi.Float, max(variances))
@@ -161,7 +169,7 @@ class TabulatedManifold(Manifold):
         return level
 
     def counts_of(self, level):
-        """Number of the nodes (``mi.Int``) of a level along y and x."""
+        """Number of nodes (``mi.Int``) of a level along y and along x."""
         index = mi.UInt32(dr.maximum(level, 0))
         return [
             dr.gather(mi.Int, n, index)
@@ -179,14 +187,14 @@ class TabulatedManifold(Manifold):
         return error
 
     def node_kernel(self, query: Query) -> TexelKernel:
-        """The footprint's kernel on the lattice of its level, in units of the nodes' distance.
+        """The footprint's kernel on the lattice of its level, in units of the nodes' spacing.
 
-        It is narrower, by the variance that the functions of the nodes add.
+        It is narrowed by the variance that the functions of the nodes add.
         """
         return query.once((self, "node kernel"), lambda: self.make_node_kernel(query))
 
     def make_node_kernel(self, query: Query) -> TexelKernel:
-        """What :meth:`node_kernel` returns."""
+        """Compute what :meth:`node_kernel` returns."""
         tables, level = self.known_tables, self.level(query)
         nodes = [
             mi.Float(n) * opaque(mi.Float, 1 / p)
@@ -207,16 +215,16 @@ class TabulatedManifold(Manifold):
             self.normal_map.wrap_mode,
             tuple(added),
         )
-        # Texels have their centres on the corners of quads, nodes in the middle of their cells.
+        # The centres of texels are corners of quads; nodes are in the middle of their cells.
         kernel.mean -= 0.5 * per_texel
         return kernel
 
     def every_node(self, kernel, active, visit, *state):
         """Visit all nodes of a level under a kernel from :meth:`node_kernel`, row by row.
 
-        ``visit(nodes, *state)`` returns the new ``state``. Each of some nodes at a time comes as
-        ``(weight, y, x, active)``; the weight is k(u_k − x), 0 where not active; the place in the
-        lattice, ``y``, ``x`` (``mi.Int``), does not wrap.
+        Calls ``visit(nodes, *state)`` with a few nodes at a time; it returns the new ``state``.
+        A node is ``(weight, y, x, active)``. The weight is k(u_k − x), and 0 where the node is not
+        active. The indices ``y``, ``x`` (``mi.Int``) in the lattice do not wrap.
         """
         mean = mi.Vector2f(kernel.mean)
 
@@ -232,7 +240,7 @@ class TabulatedManifold(Manifold):
         per_turn = tuning().nodes_per_turn
 
         def body(y, x, last, active, *state):
-            # Some nodes at a time: a step takes about as long as it takes to find the next row.
+            # A few nodes at a time: to find the next row costs about as much as a node.
             nodes = []
             for step in range(per_turn):
                 inside = active & (x + step <= last)
@@ -261,7 +269,7 @@ class TabulatedManifold(Manifold):
         count_y, count_x = self.counts_of(level)
 
         def add(nodes, mass, total):
-            # A single sum: Dr.Jit takes loops that add to a state for what they are, or not at all.
+            # One addition to each state variable: only then Dr.Jit sees that the loop is a sum.
             masses, weights = mi.Float(0), mi.Float(0)
             for weight, y, x, active in nodes:
                 y, x = (wrapped(*v) for v in ((y, count_y), (x, count_x)))
@@ -277,24 +285,25 @@ class TabulatedManifold(Manifold):
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """Draw a projected normal with the density that :meth:`_eval` gives."""
+        """Draw a projected normal with density D."""
         exact = super()._sample(query, sample1, sample2, active)
         if self.tables is None:
             return exact
         return dr.select(self.level(query) < 0, exact, self.draw_table(query, sample2, active))
 
     def draw_table(self, query: Query, sample2: mi.Point2f, active: mi.Bool) -> mi.Vector2f:
-        """A node by its weight, a place under its spline, the normal there, a place in its bin."""
+        """Draw a projected normal from the tables: a node in proportion to its weight, a position
+        under its spline, and a position in the bin of the normal there."""
         kernel, level = self.node_kernel(query), self.level(query)
         active = active & (level >= 0)
 
-        # Sampling takes more numbers than the two given: the others are hashed from them.
+        # The sampler needs more than two random numbers: they are a hash of the two given.
         a, b = (dr.reinterpret_array(mi.UInt32, mi.Float(u)) for u in (sample2.x, sample2.y))
         randoms = [uniform(v) for stream in range(5) for v in pcg3d(a, b, mi.UInt32(stream))]
         choice, *of_nodes, l1, l2, bin_x, bin_y = randoms[:13]
 
         def pick(nodes, total, choice, at_y, at_x):
-            """Weighted reservoir of one, which stretches the random number and uses it again."""
+            """Weighted reservoir sampling with one random number, rescaled after each decision."""
             for weight, y, x, active in nodes:
                 total = total + weight
                 chance = weight / dr.select(total > 0, total, 1)
@@ -318,12 +327,12 @@ class TabulatedManifold(Manifold):
             strict=True,
         )
         for count, index, axis, fine, u in axes:
-            # The function of a node is a spline, or one of some finer splines at random.
+            # The function of a node is a spline, or a mixture of finer splines: draw one of these.
             fine = opaque(mi.Int, fine)
             between = 3 * count == 2 * fine
             index = dr.select(between, finer_node(index, u[3]), index)
             spacing = mi.Float(axis.count) / mi.Float(dr.select(between, fine, count))
-            # A quadratic B-spline is the distribution of a sum of three uniform numbers.
+            # A quadratic B-spline is the density of a sum of three uniform numbers.
             place = (mi.Float(index) - 1 + u[0] + u[1] + u[2]) * spacing
             quad.append(axis.locate(floor_int(place))[1])
 
@@ -343,7 +352,8 @@ def wrapped(index, count):
 
 
 def finer_node(index, u):
-    """One of the nodes that make up a node of the level two thirds as fine, see ``TWO_THIRDS``."""
+    """Draw one of the finest nodes whose mixture is the function of the node ``index`` in the level
+    with two thirds as many nodes, see ``TWO_THIRDS``."""
     left, nearest, _ = (weight / sum(TWO_THIRDS) for weight in TWO_THIRDS)
     step = dr.select(u < left, -1, dr.select(u < left + nearest, 0, 1))
     return ((3 * index) >> 1) + dr.select((index & 1) == 0, step, 1 - step)
