@@ -14,7 +14,7 @@ Path tracer with footprints (:monosp:`glint_path`)
 
  * - rr_depth
    - |int|
-   - Path depth from which on paths may be ended by *russian roulette*. (Default: 5)
+   - Path depth from which *russian roulette* may end paths. (Default: 5)
 
  * - hide_emitters
    - |bool|
@@ -26,95 +26,94 @@ Path tracer with footprints (:monosp:`glint_path`)
 
  * - pixel_share
    - |string| or |float|
-   - Share of the pixel filter's variance that footprints carry, in [0, 1]; the rest places the
-     samples. 0 is sampling alone. (Default: :monosp:`auto`, one for a single sample per pixel,
-     falling slowly with their number)
+   - Share of the pixel filter's variance that footprints carry, in [0, 1]; samples are placed with
+     the rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 for a
+     single sample per pixel, and falls slowly with their number)
 
  * - light_share
    - |string| or |float|
    - Share of a small light's extent that P-NDFs integrate, in [0, 1]; the rest is sampled. 0 is
-     sampling alone. (Default: :monosp:`auto`, one for a single sample per pixel, falling slowly
-     with their number)
+     sampling alone. (Default: :monosp:`auto`, which is 1 for a single sample per pixel, and falls
+     slowly with their number)
 
  * - emitters
    - |string|
-   - Which emitters are asked at a hit: :monosp:`all`, that is every small one of at most 16, the
-     most powerful, and one of the others at random; or :monosp:`one` of all, at random.
+   - The emitters to sample at a hit. :monosp:`all`: each of the 16 most powerful ones that are not
+     environments, and one of the others at random. :monosp:`one`: one of all emitters at random.
      (Default: :monosp:`all`)
 
 This is Mitsuba's :monosp:`path` (BSDF and emitter sampling, combined by multiple
 importance sampling), with one addition: the surface interaction that it hands to a BSDF carries
 the UV partials ``duv_dx`` and ``duv_dy`` of the pixel, at *every* hit. Glint BSDFs average their
 normals over this footprint. The stock integrators leave the partials at zero in Mitsuba's JIT
-variants, and a glint BSDF then has to fall back to the cone of its ``pixel_spread`` parameter,
-which knows the distance to the last hit only.
+variants. A glint BSDF then has to use the cone of its ``pixel_spread`` parameter, which knows only
+the distance to the last hit.
 
-At the first hit the partials come from the sensor's ray differentials. Beyond it they come from a
-ray cone with an elliptical cross-section: it grows with distance, changes at each bounce by the
-curvature of the surface and the index of refraction :cite:`Igehy1999`, and is widened by the lobe
-that the next direction was sampled from. A direction of density :math:`p` stands for the solid
-angle :math:`1/(p\,\mathrm{spp})` :cite:`Suykens2001`; smooth mirrors and glass widen nothing. What
-a mirror shows is thus filtered as sharply as its image, and what a rough surface shows is filtered
-as broadly as its lobe :cite:`AkenineMoller2021`. Sensors without ray differentials start with a
-cone of no width.
+At the first hit the partials come from the sensor's ray differentials. At later hits they come from
+a ray cone with an elliptical cross-section. It grows with distance. At each bounce it changes by
+the curvature of the surface and the index of refraction :cite:`Igehy1999`, and the lobe that the
+next direction was sampled from widens it. A direction of density :math:`p` stands for the solid
+angle :math:`1/(p\,\mathrm{spp})` :cite:`Suykens2001`; smooth mirrors and glass do not widen the
+cone. So a surface seen in a mirror is filtered as sharply as the mirror's image, and a surface seen
+by a rough reflection is filtered as broadly as its lobe :cite:`AkenineMoller2021`. Sensors without
+ray differentials start with a cone of width 0.
 
-For scenes without glint BSDFs (or other BSDFs that read UV partials) the image is that of
-``path``, sample by sample. Participating media are not handled, and only JIT variants are
-supported. The partials are treated as constants when the rendering is differentiated.
+For scenes without glint BSDFs (or other BSDFs that read UV partials) the image is equal to that of
+``path``, sample by sample. Participating media are ignored, and only JIT variants are supported.
+Derivatives treat the partials as constants.
 
-**The pixel's filter is shared.** The value of a pixel is the image filtered by the film's
-reconstruction filter, of variance Σ. Footprints filter what they cover, and so a share
-:math:`a` of Σ is theirs; samples are drawn from the filter itself, contracted by
-:math:`\sqrt{1 - a}` towards the pixel's centre, and count in this pixel only :cite:`Ernst2006`.
-Variances add: with Mitsuba's default, a Gaussian, the two together are the filter, whatever
-:math:`a` is; of other filters mean and variance are kept. Scaling footprints by
-:math:`1/\sqrt{\mathrm{spp}}` instead, as Mitsuba does with ray differentials, covers the pixel by
-chance, and the error hardly falls with the number of samples. As a footprint takes the surface for
-flat and its UV coordinates for affine, :monosp:`auto` lets :math:`a` fall slowly with the number of
-samples of the whole image, in however many passes it is rendered: the image is consistent.
+**Footprints and samples share the pixel's filter.** The value of a pixel is the image filtered by
+the film's reconstruction filter, of variance Σ. Footprints filter as well, so they carry a share
+:math:`a` of Σ. Samples are drawn from the filter, contracted by :math:`\sqrt{1 - a}` towards the
+pixel's centre, and each counts in one pixel only (filter importance sampling :cite:`Ernst2006`).
+Variances add. So with Mitsuba's default filter, a Gaussian, both together are exactly the filter,
+whatever :math:`a` is; with other filters they have its mean and variance. Mitsuba scales ray
+differentials by :math:`1/\sqrt{\mathrm{spp}}` instead. Footprints of this size cover the pixel only
+by chance, and the error hardly falls with the number of samples. A footprint approximates the
+surface as flat and its UV coordinates as affine. So :monosp:`auto` lets :math:`a` fall slowly with
+the number of samples of the whole image, in however many passes it is rendered. The image is then
+consistent.
 
-That needs the film to be an :monosp:`hdrfilm` and the filter to have a positive variance, which
-:monosp:`catmullrom` and :monosp:`lanczos` do not have; otherwise, and inside other integrators such
-as :monosp:`aov`, footprints are scaled by :math:`1/\sqrt{\mathrm{spp}}`. So are those of
-derivatives, which Mitsuba renders by itself.
+This needs an :monosp:`hdrfilm`, and a filter with a positive variance, which :monosp:`catmullrom`
+and :monosp:`lanczos` do not have. Otherwise, and inside other integrators such as :monosp:`aov`,
+footprints are scaled by :math:`1/\sqrt{\mathrm{spp}}`. They are scaled in the same way for
+derivatives, which Mitsuba renders itself.
 
-**Every small light is asked at every hit**, as to choose one is noise that glints make large.
-Environments are not small; one emitter of all those that are not asked is chosen in proportion to
-its ``sampling_weight``.
+**Small lights are sampled at every hit**, as the noise of a random choice would be large on glints.
+Environments are not small. One of the remaining emitters is chosen in proportion to its
+``sampling_weight``.
 
-**Small lights are integrated by the P-NDF**, where it can do that: that of
-:ref:`glint_elements <bsdf-glint_elements>`. A light seen as a disk of up to 0.5 radians, or as
-another surface with such variances of directions, is split as the pixel is. A share of its
-variance becomes a spread of half vectors, over which the P-NDF is averaged in closed form; the rest
-is sampled, by directions contracted towards the light's centre. Visibility and radiance are those
-of the points themselves, so shadows and textures keep their mean. BSDF sampling then finds these
-lights no more, and nothing counts twice.
+**The P-NDF integrates small lights** in BSDFs that are able to do so, which is
+:ref:`glint_elements <bsdf-glint_elements>`. A light is small if it looks like a disk with a radius
+of at most 0.5 radians, or like another surface with such a variance of directions. This variance is
+split as the pixel's filter is. A share becomes a spread of half vectors, over which the P-NDF is
+averaged in closed form. The rest is sampled, by directions contracted towards the light's centre.
+Visibility and radiance are taken at the sampled points, so shadows and textures keep their mean.
+BSDF sampling then leaves these lights out, and nothing counts twice.
 
-Over a footprint the half vector turns, as the surface is curved, and camera and light are near.
-These BSDFs are told how: the P-NDF sees the map as if its normals turned the other way. On a ball
-under four lights as large as the sun, at 14 texels to a pixel and 16 samples, the bias of the image
-falls from 0.115 of its contrast to 0.02 by that.
+The half vector turns over a footprint, as the surface is curved, and as camera and light are near.
+The integrator passes this turn to these BSDFs, whose P-NDF then sees the map as if its normals
+turned in the opposite direction.
 
-**Separated illumination.** Light that has been scattered before it arrives comes from everywhere,
-and what glints add to its reflection is noise rather than something to see. With
-:monosp:`separate` on, glints are therefore kept to *direct* light, and glint BSDFs show *indirect*
-light their smooth counterpart, the Beckmann lobe of the roughness that all their glints have
-together :cite:`Tan2022`: that of the whole map, or :monosp:`alpha` of :monosp:`glint_grid`;
-:monosp:`glint_filtered` and :monosp:`glint_diffuse` are smooth already. Behind a rough bounce
-footprints are wide, and glints cost most where nobody sees them: without them
-``scenes/interreflection.xml`` takes 0.5 to 0.8 times as long, at equal noise, where
-:monosp:`max_error` bounds the cost of wide footprints, and less than a hundredth where nothing
-does. And the indirect image can be denoised without a glint being smoothed away, which
-``glintbsdf render --denoise`` does.
+**Separated illumination.** Indirect light comes from everywhere, and its reflection by glints is
+noise rather than a visible pattern. With :monosp:`separate` on, only *direct* light meets glints.
+For *indirect* light, glint BSDFs use their smooth counterpart, the Beckmann lobe of the roughness
+that all their glints have together :cite:`Tan2022`. This is the roughness of the whole map, or
+:monosp:`alpha` of :monosp:`glint_grid`; :monosp:`glint_filtered` and :monosp:`glint_diffuse` are
+smooth already. Behind a rough bounce footprints are wide, and glints cost most where nobody sees
+them. Without them ``scenes/interreflection.xml``, in which :monosp:`max_error` bounds the cost of
+wide footprints, takes 0.5 to 0.8 times as long (``python -m benchmarks separation``). Also, the
+indirect image can be denoised without smoothing a glint away: ``glintbsdf render --denoise`` does
+so.
 
-Direct is the light that one straight segment brings to the first surface that is not a mirror,
-smooth glass or an opening of a mask: what these show counts as seen by the camera, so that glints
-stay in mirrors. Emitters that the camera sees count as direct as well. The image then has further
-channels, :monosp:`direct.R`, :monosp:`.G`, :monosp:`.B` and :monosp:`indirect.R`, :monosp:`.G`,
-:monosp:`.B`, which add up to the whole. Two directions are followed where a path first meets a
-rough surface, one by the glints, for emitters only, and one by the smooth lobe. The indirect image
-differs in expectation from that of :monosp:`separate` off as far as the smooth lobe differs from
-the glints. In BSDFs of one's own: see ``glintbsdf.bridge.separation``.
+Direct light reaches the first rough surface of a path along one straight segment. Mirrors, smooth
+glass and openings of a mask do not count as surfaces here: the camera sees through them, so that
+glints stay visible in mirrors. Emitters that the camera sees count as direct light, too. The image
+has further channels, :monosp:`direct.R`, :monosp:`.G`, :monosp:`.B` and :monosp:`indirect.R`,
+:monosp:`.G`, :monosp:`.B`, which add up to the whole. At its first rough surface, a path follows
+two directions: one sampled from the glints, which looks for emitters only, and one sampled from the
+smooth lobe. The expected indirect image differs from the one with :monosp:`separate` off, as the
+smooth lobe differs from the glints. For BSDFs of your own, see ``glintbsdf.bridge.separation``.
 
 .. tabs::
     .. code-tab:: xml
@@ -210,11 +209,11 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
     def sharing(
         self, scene: mi.Scene, film: mi.Film, samples: int
     ) -> Iterator[SharedFilter | None]:
-        """In the block, footprints carry their share of the filter of ``film``, for an image of so
-        many ``samples`` per pixel.
+        """A context in which footprints carry their share of the filter of ``film``, for an image
+        with this number of ``samples`` per pixel.
 
-        Yields how samples are to be placed; None where they are not to be drawn from the filter:
-        on films other than ``hdrfilm``, with filters whose variance is not positive, and, unless
+        Yields how to place samples. Yields None if samples are not drawn from the filter: on films
+        other than ``hdrfilm``, with filters whose variance is not positive, and, unless
         ``pixel_share`` is a number, in scenes without footprints.
         """
         pixel_filter = PixelFilter(film.rfilter())
@@ -231,8 +230,8 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             self.pixels_per_differential = None
 
     def sized(self, ray: mi.RayDifferential3f, samples: int) -> mi.RayDifferential3f:
-        """The sensor's ray, with differentials of the size that footprints are to have. They come
-        scaled by 1/√samples, as everywhere in Mitsuba."""
+        """The sensor's ray, with differentials rescaled to the size of footprints. Mitsuba passes
+        them scaled by 1/√samples."""
         if not ray.has_differentials or self.pixels_per_differential is None:
             return ray
         sized = mi.RayDifferential3f(mi.Ray3f(ray))
@@ -254,8 +253,8 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         medium: mi.Medium | None = None,
         active: mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-        """Radiance along the sensor's rays, whether it belongs to a surface, and the AOVs: none,
-        or direct and indirect light."""
+        """Radiance along the sensor's rays, whether the rays hit a surface, and the AOVs, which are
+        direct and indirect light, or none."""
         if dr.hint(self.max_depth == 0, mode="scalar"):
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
 
@@ -273,14 +272,14 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         ray = mi.Ray3f(ray_)  # Current ray
         cone = RayCone.from_ray(ray_)  # Its width, for footprints
         active = mi.Bool(active)  # Active SIMD lanes
-        L = mi.Spectrum(0)  # Radiance accumulator; of indirect light where it is separate
+        L = mi.Spectrum(0)  # Radiance accumulator; of indirect light only if it is separate
         β = mi.Spectrum(1)  # Path throughput weight
         η = mi.Float(1)  # Index of refraction
         depth = mi.UInt32(0)  # Depth of current vertex
         bsdf_ctx = smooth_context() if self.separate else mi.BSDFContext()
         glint_ctx = mi.BSDFContext()
 
-        # Separate illumination: direct light, and whether nothing rough lies behind the ray
+        # Separate illumination: direct light, and whether the path has met no rough surface so far
         L_direct = mi.Spectrum(0) if self.separate else None
         seen = mi.Bool(True) if self.separate else None
 
@@ -288,9 +287,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         si_prev = dr.zeros(mi.Interaction3f)
         bsdf_pdf_prev = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
-        integrated_prev = mi.Bool(False)  # By the BSDF: small lights
+        integrated_prev = mi.Bool(False)  # Whether that BSDF integrates small lights
 
-        # An environment is visible by itself, everything else once a path has met it
+        # An environment is always visible, everything else once a path has hit it
         valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
 
         pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -338,11 +337,11 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 si.compute_uv_partials(ray_)
                 si.duv_dx = dr.select(depth == 0, si.duv_dx, duv_dx)
                 si.duv_dy = dr.select(depth == 0, si.duv_dy, duv_dy)
-                # Where a path ends nothing is reflected, and a wide footprint would be costly
+                # A path that ends here reflects nothing, and a wide footprint would be costly
                 si.duv_dx = dr.select(active_next, si.duv_dx, 0)
                 si.duv_dy = dr.select(active_next, si.duv_dy, 0)
                 curved = dr.detach(mi.SurfaceInteraction3f(si))
-            # BSDFs are told of the curvature in another way
+            # BSDFs get the curvature in another form, see Hit.seen_under
             si.dn_du, si.dn_dv = mi.Vector3f(0), mi.Vector3f(0)
 
             # ---------------------- Emitter sampling ----------------------
@@ -366,7 +365,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
             active_bs = active_next
             if dr.hint(light_share is not None and not self.separate, mode="scalar"):
-                # Where a path ends next, and no light is left for it to find
+                # Skip the sample if the path ends at the next hit and cannot find a light there
                 active_bs &= (depth + 2 < self.max_depth) | ~hit.finds_all_lights()
             bs, bsdf_weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_bs)
             bsdf_weight = dr.select(active_bs, bsdf_weight, 0)
@@ -378,8 +377,8 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 glints = active_next & seen
                 bs_glint, weight = bsdf.sample(glint_ctx, si, sample_1, sample_2, glints)
 
-                # Look for an emitter in the direction of a glint. What mirrors, glass and null
-                # interfaces show is found by the path itself, which goes on along them.
+                # Look for an emitter in the direction of a glint. Emitters behind mirrors, glass
+                # and null interfaces are found by the path itself, which continues through them.
                 glints &= mi.has_flag(bs_glint.sampled_type, mi.BSDFFlags.Smooth)
                 ray_glint, weight = scatter(bsdf, glint_ctx, si, bs_glint, weight, glints)
                 si_glint = scene.ray_intersect(ray_glint, glints)
@@ -452,10 +451,10 @@ def has_footprints(scene: mi.Scene) -> bool:
 
 
 class Hit:
-    """A surface interaction, and what its BSDF is asked about the scene's lights.
+    """A surface interaction, and how its BSDF is evaluated for the scene's lights.
 
     Attributes:
-        integrates (mi.Bool): whether the BSDF integrates small lights, of which it gets ``share``.
+        integrates (mi.Bool): whether the BSDF integrates a ``share`` of small lights.
     """
 
     def __init__(
@@ -475,22 +474,24 @@ class Hit:
 
         Args:
             curved: the interaction with ``dn_du`` and ``dn_dv``, detached.
-            cone: there, with the differentials of the direction that it is seen from.
+            cone: the ray cone at the interaction.
+            share: the share of a light's extent to integrate, in (0, 1].
         """
         self.curved, self.share = curved, share
         self.integrates = (self.bsdf.flags() & INTEGRATES_LIGHTS) != 0
         self.turned = cone.turned_per_uv(curved)
 
     def finds_all_lights(self) -> mi.Bool:
-        """Where emitter sampling leaves no light to BSDF sampling."""
+        """Whether emitter sampling finds all lights, so that BSDF sampling need not."""
         mirrors = mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Delta)
         return self.integrates & ~mirrors & self.lights.all_small(self.si.p)
 
     def seen_under(
         self, ds: mi.DirectionSample3f, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f, mi.Bool]:
-        """For a sample of an emitter: the interaction with what it tells the BSDF, the direction
-        that the BSDF is to be asked (world space), and whether it integrates the emitter."""
+        """For a sample of an emitter: the interaction, with the turn of the half vector and the
+        spread of the light in it; the direction to evaluate the BSDF for (world space); and whether
+        the BSDF integrates the emitter."""
         if self.share is None:
             return self.si, ds.d, mi.Bool(False)
         with dr.suspend_grad():
@@ -501,30 +502,32 @@ class Hit:
             far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             inverse_distance = dr.select(far, 0, dr.rcp(ds.dist))
             turn = half_vector_turn(si, d, *self.turned, inverse_distance)
-            # A light that BSDF sampling finds as well must be the same to both.
+            # For a light that BSDF sampling finds, too, the BSDF must have the same value: no turn.
             small = self.integrates & view.small
             turn = (dr.select(small | ds.delta, w, 0) for w in turn)
-            told = Carried(*turn, variance).put(si)
+            carrier = Carried(*turn, variance).put(si)
         si = mi.SurfaceInteraction3f(self.si)
-        si.dn_du, si.dn_dv = told.dn_du, told.dn_dv
+        si.dn_du, si.dn_dv = carrier.dn_du, carrier.dn_dv
         return si, dr.select(variance > 0, d, ds.d), small
 
 
 def direct_light(
     hit: Hit, sampler: mi.Sampler, lobes: list[tuple[mi.BSDFContext, mi.Bool]]
 ) -> list[mi.Spectrum]:
-    """What a BSDF reflects of the light that comes straight from emitters: from each one that is
-    asked at every hit, and from one of the others; for each of the ``lobes``, that is a context and
-    the lanes in which it is wanted."""
+    """Light that comes straight from emitters and is reflected by the BSDF.
+
+    It comes from all emitters that are sampled at every hit, and from one of the others. ``lobes``
+    are pairs of a context and of the lanes in which it is needed; there is a result for each.
+    """
     lights = hit.lights
     active = lobes[0][1]
     for _, wanted in lobes[1:]:
         active = active | wanted
 
-    if lights.asked_count == 0:
+    if lights.sampled_count == 0:
         sample = hit.scene.sample_emitter_direction(hit.si, sampler.next_2d(), False, active)
         return reflected(hit, lobes, *sample)
-    L = light_of_all(hit, sampler, lobes, active)
+    L = light_of_sampled(hit, sampler, lobes, active)
     if lights.others_count > 0:
         emitter, probability, random = lights.choose(sampler.next_2d(), active)
         ds, weight = emitter.sample_direction(hit.si, random, active)
@@ -535,18 +538,18 @@ def direct_light(
     return L
 
 
-def light_of_all(
+def light_of_sampled(
     hit: Hit,
     sampler: mi.Sampler,
     lobes: list[tuple[mi.BSDFContext, mi.Bool]],
     active: mi.Bool,
 ) -> list[mi.Spectrum]:
-    """The part of :func:`direct_light` that comes from emitters asked at every hit."""
+    """The part of :func:`direct_light` from emitters that are sampled at every hit."""
     lights = hit.lights
-    end = dr.opaque(mi.UInt32, lights.asked_count)
+    end = dr.opaque(mi.UInt32, lights.sampled_count)
 
-    def ask(k, sampler, L):
-        emitter = dr.gather(mi.EmitterPtr, lights.asked, k, active)
+    def add(k, sampler, L):
+        emitter = dr.gather(mi.EmitterPtr, lights.sampled, k, active)
         ds, weight = emitter.sample_direction(hit.si, sampler.next_2d(), active)
         ds.emitter = emitter
         of_emitter = reflected(hit, lobes, ds, weight)
@@ -556,7 +559,7 @@ def light_of_all(
     return dr.while_loop(
         state,
         lambda k, sampler, L: active & (k < end),
-        ask,
+        add,
         max_iterations=-1,
         label="emitters",
     )[2]
@@ -568,8 +571,8 @@ def reflected(
     ds: mi.DirectionSample3f,
     weight: mi.Spectrum,
 ) -> list[mi.Spectrum]:
-    """What each lobe reflects of one sample ``ds`` of an emitter: weighed against the chance that
-    BSDF sampling would have found it, and zero where something is in between."""
+    """Light of one sample ``ds`` of an emitter that each lobe reflects. It is weighted for multiple
+    importance sampling with the BSDF, and 0 where the emitter is hidden."""
     sampled = ds.pdf != 0
 
     # Recompute the contribution with AD to enable light source optimization
@@ -588,7 +591,7 @@ def reflected(
         alone = ds.delta | integrated
         value = value * weight * dr.select(alone, 1, mis_weight(ds.pdf, pdf))
         if not dr.grad_enabled(value):
-            # Most places of a map reflect nothing of a light.
+            # Most points of a map reflect nothing of a light, and need no shadow ray.
             active = active & (dr.max(mi.unpolarized_spectrum(value)) != 0)
         values.append(value)
         needed.append(active)
@@ -608,9 +611,12 @@ def emission(
     delta_prev: mi.Bool,
     integrated_prev: mi.Bool,
 ) -> mi.Spectrum:
-    """What the emitter at ``si``, if any, sends to ``si_prev``, where a BSDF sample of density
-    ``pdf_prev`` has found it: weighed against the chance that emitter sampling would have. Zero
-    where the density is zero, and for a small light that the BSDF has integrated."""
+    """Emission to ``si_prev`` of the emitter at ``si``, if there is one.
+
+    A BSDF sample of density ``pdf_prev`` has found it. It is weighted for multiple importance
+    sampling with emitters, and 0 where the density is 0, or where the BSDF has already integrated
+    this emitter.
+    """
     ds = mi.DirectionSample3f(scene, si, si_prev)
     if lights.extents:
         counted = integrated_prev & lights.view(ds.emitter, si_prev.p).small
@@ -629,8 +635,8 @@ def scatter(
 ) -> tuple[mi.Ray3f, mi.Spectrum]:
     """The ray in the direction that was sampled, and the sample's weight in world space.
 
-    Samples must not move with the parameters that the image is differentiated by: the direction is
-    kept, and derivatives reach the BSDF's value only.
+    Samples must not move with the parameters that the image is differentiated by. So the direction
+    is detached, and only the BSDF's value carries derivatives.
     """
     weight = si.to_world_mueller(weight, -bs.wo, si.wi)
     ray = si.spawn_ray(si.to_world(bs.wo))
@@ -661,7 +667,7 @@ def to_rgb(spectrum: mi.Spectrum, ray: mi.Ray3f) -> list[mi.Float]:
 
 
 def spectrum_fma(a: mi.Spectrum, b: mi.Spectrum, c: mi.Spectrum) -> mi.Spectrum:
-    """``a b + c``: in one rounding, or with the Mueller matrices' product in polarised variants."""
+    """``a b + c``, with one rounding; in polarised variants a product of Mueller matrices."""
     return a * b + c if mi.is_polarized else dr.fma(a, b, c)
 
 

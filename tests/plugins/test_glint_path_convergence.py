@@ -12,7 +12,7 @@ import pytest
 
 from glintbsdf.core.errors import ParameterError
 from glintbsdf.footprint.pixel_filter import PixelFilter, automatic_share
-from glintbsdf.lights.small import MOST, SmallLights
+from glintbsdf.lights.small import MAX_SAMPLED, SmallLights
 from glintbsdf.maps import procedural
 from glintbsdf.scene import passes, rendering
 
@@ -293,7 +293,7 @@ def lit_by(name):
     """Lights, and what stands in their way."""
     return {
         "one": {"light": ball_light()},
-        "many": many_lights(2 * MOST),
+        "many": many_lights(2 * MAX_SAMPLED),
         "mixed": mixed_lights(),
         "occluded": {
             "light": ball_light((0, 0, 8), 1.0),
@@ -331,7 +331,7 @@ def test_mean_is_that_of_path(variant, name, emitters):
     )
 
 
-def test_each_light_of_a_few_is_asked(variant):
+def test_each_light_of_a_few_is_sampled(variant):
     """Four lights: their choice is noise no more."""
     scene = glints(
         **{f"l{k}": ball_light((2 * k - 3, 0, 8), 0.02, 1000.0 * 4.0**k) for k in range(4)}
@@ -345,7 +345,7 @@ def test_each_light_of_a_few_is_asked(variant):
 
 
 def test_thousands_of_emitters(variant):
-    """As many as :data:`MOST` are asked, the strongest; of the others one."""
+    """The :data:`MAX_SAMPLED` most powerful emitters are sampled, and one of the others."""
     weak = {
         f"w{k}": {"type": "point", "position": [k, 0, 9], "intensity": 1.0} for k in range(2000)
     }
@@ -355,17 +355,17 @@ def test_thousands_of_emitters(variant):
         sky={"type": "constant"},
     )
     lights = SmallLights(scene)
-    assert lights.asked_count == MOST and lights.others_count == 2002 - MOST
+    assert lights.sampled_count == MAX_SAMPLED and lights.others_count == 2002 - MAX_SAMPLED
     image = images(scene, "glint_path", 4, 1, max_depth=2)
     assert np.all(np.isfinite(image)) and image.max() > 0
 
 
 def test_probabilities_of_emitters(variant):
-    """One for those asked at every hit; the others share one by their weights."""
-    scene = glints(**many_lights(MOST + 3), sky={"type": "constant", "sampling_weight": 2.0})
+    """It is 1 for emitters sampled at every hit; the others share a sum of 1 by their weights."""
+    scene = glints(**many_lights(MAX_SAMPLED + 3), sky={"type": "constant", "sampling_weight": 2.0})
     lights = SmallLights(scene)
-    p = dr.gather(mi.Float, lights.probability, lights.name(scene.emitters_dr())).numpy()
-    assert (p == 1).sum() == MOST and abs(p[p < 1].sum() - 1) < 1e-6
+    p = dr.gather(mi.Float, lights.probability, lights.registry_index(scene.emitters_dr())).numpy()
+    assert (p == 1).sum() == MAX_SAMPLED and abs(p[p < 1].sum() - 1) < 1e-6
     assert abs(p[p < 1].max() - 2 / 5) < 1e-6
 
 

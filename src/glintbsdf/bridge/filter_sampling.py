@@ -1,8 +1,9 @@
-"""Rendering whose samples are drawn from the film's filter rather than spread by it.
+"""Rendering with filter importance sampling: the film's filter is the density of samples.
 
-Mitsuba's integrators draw samples all over the image, and each counts in the pixels around it by
-the film's filter. Here each sample belongs to one pixel, and lies about its centre with the filter
-as its density, contracted perhaps: see :mod:`~glintbsdf.footprint.pixel_filter`.
+Mitsuba's integrators draw samples uniformly over the image, and the film's filter distributes each
+of them over the pixels around it. Here each sample belongs to one pixel. Its offset from the
+pixel's centre is drawn from the filter, and may be contracted, see
+:mod:`~glintbsdf.footprint.pixel_filter`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.footprint.pixel_filter import PixelFilter
 
-#: A wavefront's samples are counted in 32 bits.
+#: Largest number of samples of a wavefront: they are counted in 32 bits.
 LARGEST_WAVEFRONT = 2**32 - 1
 
 #: Steps of Roberts's two-dimensional low-discrepancy sequence: the powers of 1/ρ, ρ³ = ρ + 1.
@@ -25,11 +26,11 @@ LATTICE_STEPS = 0.7548776662466927, 0.5698402909980532
 
 @dataclass(frozen=True)
 class SharedFilter:
-    """A film's filter, a share of which footprints carry.
+    """A film's filter, of which footprints carry a share.
 
     Attributes:
-        pixel_filter (PixelFilter): of the film.
-        contraction (float): factor on the samples' offsets from their pixel's centre, in [0, 1].
+        pixel_filter (PixelFilter): the film's filter.
+        contraction (float): factor on a sample's offset from its pixel's centre, in [0, 1].
     """
 
     pixel_filter: PixelFilter
@@ -38,11 +39,11 @@ class SharedFilter:
     def place(
         self, sampler: mi.Sampler, x: mi.UInt32, y: mi.UInt32, order: mi.UInt32, seed: mi.UInt32
     ) -> tuple[mi.Vector2f, mi.Float]:
-        """Where the sample numbered ``order`` of the pixel (``x``, ``y``) lies: its offset from the
-        pixel's centre (pixels), and the sign of its weight.
+        """Place the sample number ``order`` of the pixel (``x``, ``y``): returns its offset from
+        the pixel's centre (pixels), and the sign of its weight.
 
-        Samplers that stratify the samples of a pixel are asked; in place of independent numbers
-        comes a low-discrepancy sequence.
+        The numbers come from the sampler if it stratifies the samples of a pixel. A
+        low-discrepancy sequence replaces the numbers of an independent sampler.
         """
         if sampler.class_name() == "IndependentSampler":
             random = lattice_point(order, x, y, seed)
@@ -51,11 +52,11 @@ class SharedFilter:
         offset, sign = self.pixel_filter.sample(random)
         return offset * dr.opaque(mi.Float, self.contraction), sign
 
-    def weighed(
+    def channels(
         self, sign: mi.Float, values: list[mi.Float], aovs: list[mi.Float]
     ) -> list[mi.Float]:
-        """What a film stores of a sample: ``values`` and ``aovs`` with its sign, and its weight
-        between the two."""
+        """The channels of a sample in the film: ``values`` times its sign, its weight, and ``aovs``
+        times its sign."""
         if self.pixel_filter.positive:
             return [*values, mi.Float(1), *aovs]
         weight = mi.Float(self.pixel_filter.weight**2)
@@ -74,9 +75,13 @@ def render(
     """Render into the film of ``sensor``, which must be an ``hdrfilm``.
 
     Args:
-        integrator: any; its ``sample`` gets differentials scaled by 1/√spp, as from Mitsuba.
+        integrator: any integrator; its ``sample`` gets ray differentials scaled by 1/√spp, as
+            Mitsuba's own ``render`` scales them.
+        scene, sensor: the scene, and the sensor to render.
+        shared: how to place samples.
+        seed: seed of the sampler.
         spp: samples per pixel; 0 for the sampler's own number.
-        largest: samples that may be under way at the same time; more are drawn in several passes.
+        largest: largest number of samples in one pass; more are drawn in several passes.
     """
     film = sensor.film()
     sampler = sensor.sampler().clone()
@@ -113,7 +118,7 @@ def add_samples(
     index: int,
     block: mi.ImageBlock,
 ) -> None:
-    """Add to ``block`` the pass numbered ``index``, of ``per_pass`` samples in each pixel."""
+    """Add to ``block`` the pass number ``index``, with ``per_pass`` samples in each pixel."""
     film = sensor.film()
     size, offset = film.crop_size(), film.crop_offset()
     number = dr.arange(mi.UInt32, per_pass * int(np.prod(size)))
@@ -137,13 +142,13 @@ def add_samples(
 
     radiance, valid, aovs = integrator.sample(scene, sampler, ray, sensor.get_medium(), True)
     values = colours(film, weight * radiance, valid, ray.wavelengths)
-    block.put(mi.Point2f(x, y) + 0.5, shared.weighed(sign, values, aovs))
+    block.put(mi.Point2f(x, y) + 0.5, shared.channels(sign, values, aovs))
 
 
 def colours(
     film: mi.Film, radiance: mi.Spectrum, valid: mi.Bool, wavelengths: mi.Color0f
 ) -> list[mi.Float]:
-    """The colours that an ``hdrfilm`` stores of a sample, and its alpha if there is any."""
+    """The colour of a sample as an ``hdrfilm`` stores it, and its alpha if the film has one."""
     if mi.is_polarized:
         radiance = mi.unpolarized_spectrum(radiance)
     if mi.is_spectral:
@@ -155,12 +160,14 @@ def colours(
 
 
 def lattice_point(order: mi.UInt32, x: mi.UInt32, y: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
-    """A point of the unit square: number ``order`` of an additive recurrence, all points of a pixel
-    shifted by the same random vector. Each point alone is uniformly distributed.
+    """A point of the unit square: number ``order`` of an additive recurrence.
+
+    All points of a pixel are shifted by the same random vector, so each point alone is uniformly
+    distributed. The sums are of integers, which wrap around and keep all digits.
 
     Source: Cranley and Patterson, "Randomization of Number Theoretic Methods for Multiple
     Integration", SIAM J. Numer. Anal. 13(6), 1976; Roberts, "The Unreasonable Effectiveness of
-    Quasirandom Sequences", 2018. In integers, where the sum wraps around and keeps all its digits.
+    Quasirandom Sequences", 2018.
     """
     shifts = pcg3d(x, y, seed)
     return mi.Point2f(

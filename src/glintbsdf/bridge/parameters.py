@@ -6,13 +6,12 @@ Python integers as ``int``, ``<transform>`` and every Python transform as a 4×4
 nested textures and ``mi.Bitmap`` as objects, tensors and other Dr.Jit arrays as "any". NumPy
 arrays are refused by Mitsuba itself.
 
-Properties that nobody reads are reported by Mitsuba as errors, so a parameter is read only where it
-has a meaning. A name that no parameter of the plugin has is refused here, with the one that it
-resembles.
+Mitsuba reports properties that nobody reads as errors, so a parameter is read only where it has a
+meaning. An unknown name is refused here; the error suggests the parameter that it resembles.
 
-The type and range of every parameter are declared in :data:`PARAMETERS`, and nowhere else. Ranges
-are such that single precision bears what is computed from their ends. What depends on other
-parameters or on the map is checked where it is known.
+The type and range of every parameter are declared in :data:`PARAMETERS`, and nowhere else. At the
+ends of a range, single precision is still enough for everything that is computed. Conditions that
+depend on other parameters or on the map are checked where these are known.
 """
 
 from __future__ import annotations
@@ -36,7 +35,12 @@ MAP_SOURCES = ("filename", "bitmap", "data")
 
 
 class Number(NamedTuple):
-    """A number from ``minimum`` to ``maximum``, both allowed unless ``above`` or ``below``."""
+    """A number from ``minimum`` to ``maximum``.
+
+    Attributes:
+        above, below (bool): whether the number must differ from ``minimum``, from ``maximum``.
+        whole (bool): whether it must be a whole number.
+    """
 
     minimum: float = 0.0
     maximum: float = 1e6
@@ -52,7 +56,7 @@ class Number(NamedTuple):
         return f"{kind} from {self.minimum:.10g} to {self.maximum:.10g}"
 
     def holds(self, value: object) -> bool:
-        """Whether ``value`` is a number of the range; a boolean is none."""
+        """Whether ``value`` is a number in the range; a boolean is not a number."""
         types = (int,) if self.whole else (int, float)
         if not isinstance(value, types) or isinstance(value, bool):
             return False
@@ -61,7 +65,7 @@ class Number(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What a parameter other than a number is, in words."""
+    """The type of a parameter that is not a number, in words."""
 
     name: str
 
@@ -80,7 +84,7 @@ INDEX = Kind("a number or the name of a material")
 SHARE = Kind("auto or a number from 0 to 1")
 COLORS = Kind("a name, an image file or an mi.Bitmap")
 
-#: Indices of refraction, and their imaginary part: Fresnel's equations take their fourth power.
+#: Indices of refraction, and their imaginary part. Fresnel's equations have their fourth power.
 INDICES = Number(1e-3, 1e3)
 EXTINCTION = Number(0.0, 1e3)
 
@@ -203,7 +207,7 @@ def declared(owner: str, name: str) -> Number | Kind | None:
 
 
 def declared_range(owner: str, name: str, otherwise: Number = ANY) -> Number:
-    """The range of a parameter that is a number; ``otherwise`` where none is declared."""
+    """The declared range of a number; ``otherwise`` if there is no declaration."""
     found = declared(owner, name)
     return found if isinstance(found, Number) else otherwise
 
@@ -216,12 +220,12 @@ class Parameters:
         self.owner = props.plugin_name()
 
     def refuse_unknown(self) -> None:
-        """Refuse names that no parameter of the plugin has, and name the one that is alike."""
+        """Refuse names that the plugin does not have; the error suggests one that is alike."""
         known = PARAMETERS.get(self.owner)
         if known is None:
             return
         for name in self.props.keys():
-            if name not in known and name != "deferred":  # which is set by who loads a scene
+            if name not in known and name != "deferred":  # the loader of a scene sets this one
                 alike = get_close_matches(name, known, 1, 0.6)
                 hint = f', did you mean "{alike[0]}"?' if alike else f": it has {', '.join(known)}"
                 raise ParameterError(f'{self.owner}: "{name}" is not a parameter{hint}')
@@ -231,14 +235,14 @@ class Parameters:
     # ----------------------------------------------------------------------------------------------
 
     def number(self, name: str, default: float) -> float:
-        """A number of the declared range."""
+        """A number in the declared range."""
         value = self.props.get(name, default)
         allowed = declared_range(self.owner, name)
         check(allowed.holds(value), self.owner, name, str(allowed), value)
         return float(value)
 
     def whole(self, name: str, default: int | None) -> int | None:
-        """A whole number of the declared range, or the default, which may be None."""
+        """A whole number in the declared range, or the default, which may be None."""
         if name not in self.props:
             return default
         value = self.props[name]
@@ -247,7 +251,7 @@ class Parameters:
         return value
 
     def per_axis(self, name: str, default: float) -> tuple[float, float]:
-        """``name_u`` and ``name_v``, or ``name`` for both: numbers of the declared range."""
+        """The numbers ``name_u`` and ``name_v``, or ``name`` for both, in the declared range."""
         axes = (f"{name}_u", f"{name}_v")
         self.only_one_of((name,), axes)
         if name in self.props:
@@ -255,7 +259,8 @@ class Parameters:
         return tuple(self.number(axis, default) for axis in axes)
 
     def written(self, name: str, axis: str) -> str:
-        """How a parameter of an axis was written: ``name`` for both, or ``name_u``, ``name_v``."""
+        """The name by which the value along an axis was given: ``name``, or ``name_u``,
+        ``name_v``."""
         return name if name in self.props else f"{name}_{axis}"
 
     def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
@@ -278,7 +283,7 @@ class Parameters:
         return value
 
     def only_one_of(self, *groups: tuple[str, ...]) -> None:
-        """Refuse properties of more than one of the ``groups``, which contradict each other."""
+        """Refuse properties from more than one of the ``groups``, as they contradict each other."""
         given = [[name for name in group if name in self.props] for group in groups]
         given = [group for group in given if group]
         if len(given) > 1:
@@ -291,10 +296,10 @@ class Parameters:
     # ----------------------------------------------------------------------------------------------
 
     def normal_map(self, instead: str = "") -> NormalMap:
-        """The map from ``filename``, ``bitmap`` or ``data``; a relative file name is resolved with
-        ``mi.file_resolver()``, against the scene's folder.
+        """The map from ``filename``, ``bitmap`` or ``data``.
 
-        ``instead``: a parameter that may be given in place of a map, for the message of the error.
+        ``mi.file_resolver()`` resolves relative file names, relative to the scene's folder.
+        ``instead`` is a parameter that may be given in place of a map; the error message names it.
         """
         self.only_one_of(*((source,) for source in MAP_SOURCES))
         sources = [source for source in MAP_SOURCES if source in self.props]
@@ -339,7 +344,7 @@ class Parameters:
         return NormalMap.from_array(value, **options)
 
     def to_uv(self) -> mi.ScalarAffineTransform3f:
-        """The transform of UV space, whose linear part must be finite and invertible."""
+        """The transform of UV space. It must be finite and its linear part invertible."""
         value = self.props.get("to_uv", mi.ScalarAffineTransform4f())
         check(
             self.props.type("to_uv") == mi.Properties.Type.Transform
@@ -361,9 +366,9 @@ class Parameters:
     def colors(self, name: str, choices: tuple[str, ...]) -> str | np.ndarray:
         """One of the strings ``choices``, or the colours of an image: linear RGB, N×3, float32.
 
-        The image comes from a file, whose relative name is resolved as that of a map, or from an
-        ``mi.Bitmap``. Integer pixels are sRGB unless the bitmap says otherwise, as everywhere in
-        Mitsuba. Colours must be finite and not negative.
+        The image is an ``mi.Bitmap``, or a file, whose name is resolved like the file name of a
+        map. Integer pixels are sRGB unless the bitmap says otherwise, as everywhere in Mitsuba.
+        Colours must be finite and ≥ 0.
         """
         value = self.props.get(name, choices[0])
         if isinstance(value, str) and value in choices:
@@ -371,7 +376,7 @@ class Parameters:
         requirement = f"one of {', '.join(choices)}, the name of an image file or an mi.Bitmap"
         bitmap = value
         if isinstance(value, str):
-            if dr.thread_count() < 2:  # with one, Mitsuba never returns from reading an OpenEXR
+            if dr.thread_count() < 2:  # Mitsuba hangs when it reads OpenEXR files with one thread
                 dr.set_thread_count(2)
             path = Path(str(mi.file_resolver().resolve(value)))
             check(is_file(path), self.owner, name, requirement, value)
@@ -401,8 +406,8 @@ class Parameters:
     # ----------------------------------------------------------------------------------------------
 
     def interface(self) -> Interface:
-        """What facets are made of, from ``material``, or ``eta`` and ``k``, or ``int_ior`` and
-        ``ext_ior``; a perfect mirror, the default, needs no code."""
+        """The interface of the facets, from ``material``, or ``eta`` and ``k``, or ``int_ior`` and
+        ``ext_ior``. The default is a perfect mirror, which adds no code to a kernel."""
         self.only_one_of(("material",), ("eta", "k"), ("int_ior", "ext_ior"))
         props = self.props
         if "int_ior" in props or "ext_ior" in props:
@@ -417,7 +422,8 @@ class Parameters:
         return Mirror()
 
     def specular_reflectance(self) -> mi.Texture | None:
-        """The tint, in [0, 1], or None where none is given, which needs no code."""
+        """The factor on the reflection, in [0, 1]; None if it is not given, for no code in a
+        kernel."""
         if "specular_reflectance" not in self.props:
             return None
         return self.spectrum("specular_reflectance", 1.0, 1.0)
@@ -425,7 +431,7 @@ class Parameters:
     def spectrum(self, name: str, default: float, maximum: float) -> mi.Texture:
         """A number, colour, spectrum or texture with values from 0 to ``maximum``, as a texture.
 
-        Only what is given as numbers is checked here: a texture has checked itself.
+        Only numbers are checked here: textures check themselves.
         """
         value = self.props.get(name, default)
         numeric = {
@@ -443,7 +449,7 @@ class Parameters:
             f"a number, colour, spectrum or texture of values from 0 to {maximum:g}",
             value,
         )
-        # Mitsuba bounds the colours of get_texture by 1: fit for a reflectance, not for an index.
+        # get_texture bounds colours by 1, which is right for a reflectance but not for an index.
         if maximum <= 1:
             return self.props.get_texture(name, default)
         return self.props.get_unbounded_texture(name, default)
@@ -483,12 +489,14 @@ class Parameters:
             )
             check_choice(self.owner, "material", material, ("none", *presets))
             raise
-        # Taken out: a class made here lives on as part of a cycle, and what it knows with it.
+        # Taken out of the dictionary: the class above is part of a reference cycle, and lives on
+        # with everything in its closure.
         return found.pop("eta"), found.pop("k")
 
 
 def check_to_uv(owner: str, to_uv: mi.ScalarAffineTransform3f) -> None:
-    """Refuse a transform of the UV plane that is not finite or not invertible."""
+    """Raise :class:`~.ParameterError` unless a transform of the UV plane is finite and
+    invertible."""
     matrix = to_uv.matrix
     entries = [float(matrix[row, column]) for row in range(2) for column in range(3)]
     determinant = entries[0] * entries[4] - entries[1] * entries[3]

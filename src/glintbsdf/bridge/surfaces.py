@@ -18,18 +18,18 @@ import numpy as np
 from glintbsdf.core.errors import ParameterError
 from glintbsdf.maps.normalmap import NormalMap
 
-#: A mesh whose faces disagree more than this, by area, has no orientation.
+#: A mesh has no orientation if more than this share of its area has the other one.
 _MIXED = 0.1
 
 
 def live_shapes() -> Iterator[mi.Shape]:
-    """Every shape of the active variant that is alive."""
+    """Every shape of the active variant that exists now."""
 
     def at(index: int) -> mi.Shape | None:
         return mi.ShapePtr(dr.reinterpret_array(mi.ShapePtr, mi.UInt32(index)))[0]
 
-    # Beyond the last place Dr.Jit raises an error, if there ever was a shape; else all are empty,
-    # as is a place that is free again.
+    # Dr.Jit raises an error beyond the last entry of the registry, if there has ever been a shape.
+    # Otherwise all entries are empty, and so is an entry whose shape is gone.
     with contextlib.suppress(RuntimeError):
         if at(2**31) is None:
             return
@@ -40,7 +40,7 @@ def live_shapes() -> Iterator[mi.Shape]:
 
 
 def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:
-    """The shapes whose material is ``bsdf``, or is made of it among others."""
+    """The shapes whose material is ``bsdf``, or contains it."""
     contains: dict[mi.BSDF, bool] = {}  # many shapes share one material
     found = []
     for shape in live_shapes():
@@ -55,7 +55,7 @@ def shapes_of(bsdf: mi.BSDF) -> list[mi.Shape]:
 
 
 def _holds(material: mi.Object, bsdf: mi.BSDF) -> bool:
-    """Whether ``material`` hands ``bsdf`` on in its traversal, at any depth."""
+    """Whether ``material`` contains ``bsdf`` at any depth, as its traversal shows."""
     look = _look_class(mi.variant())(bsdf)
     material.traverse(look)
     return look.found
@@ -63,11 +63,11 @@ def _holds(material: mi.Object, bsdf: mi.BSDF) -> bool:
 
 @functools.cache
 def _look_class(variant: str) -> type:
-    """The traversal of :func:`_holds`, in a variant.
+    """The class of the traversal in :func:`_holds`, for a variant.
 
-    It is made once, and holds nothing by a closure. A class is part of reference cycles: one that
-    was made for each search would keep its BSDF alive until Python's collector comes, perhaps in
-    the middle of a recording that still calls it.
+    It is made once, and has no closure. A class is part of reference cycles. If each search made
+    one with a closure, the class would keep the BSDF alive until Python's garbage collection, which
+    may come while Dr.Jit records calls of that BSDF.
     """
 
     class Look(mi.TraversalCallback):
@@ -85,11 +85,12 @@ def _look_class(variant: str) -> type:
 def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:
     """Refuse meshes without UV coordinates under a glint BSDF.
 
-    Mitsuba gives such a mesh the barycentric coordinates of each triangle in their place, so that
+    Mitsuba uses the barycentric coordinates of each triangle in place of missing UV coordinates, so
     every triangle would show the whole map.
 
     Raises:
-        ParameterError: names the plugin and the mesh, and says what to do.
+        ParameterError: a mesh has no UV coordinates; the message names the plugin and the mesh, and
+            says what to do.
     """
     for shape in shapes:
         buffers = mi.traverse(shape) if shape.is_mesh() else {}
@@ -102,12 +103,12 @@ def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:
 
 
 def uv_orientation(shape: mi.Shape) -> int:
-    """1 where u, v and the normal of a surface are right-handed, -1 where left-handed, else 0.
+    """1 if u, v and the normal of a surface are right-handed, −1 if they are left-handed, else 0.
 
     Mirrored UVs are left-handed, and so are the UVs of every OBJ file as Mitsuba loads it. Faces
-    count by area; meshes whose faces disagree give 0, as do shapes that cannot tell. The registry
-    knows a shape only by the class that Python has first seen it as, so a mesh is asked by its
-    parameters.
+    count by area. The result is 0 for meshes whose faces disagree, and for shapes without a
+    parameterisation. A shape from the registry may have lost its class in Python, so the buffers of
+    a mesh are read from its parameters.
     """
     buffers = mi.traverse(shape) if shape.is_mesh() else {}
     if "vertex_texcoords" not in buffers:  # a rectangle, a sphere, …
@@ -116,7 +117,7 @@ def uv_orientation(shape: mi.Shape) -> int:
         except RuntimeError:
             return 0
         signs = np.sign(np.array(dr.dot(dr.cross(si.dp_du, si.dp_dv), mi.Vector3f(si.sh_frame.n))))
-        # A rectangle's own parameterisation, unlike its intersections, knows of no flip.
+        # The parameterisation of a rectangle ignores flip_normals, unlike its intersections.
         signs = -signs if shape.is_mesh() and shape.has_flipped_normals() else signs
         return int(signs[0]) if (signs == signs[0]).all() else 0
     if not len(buffers["vertex_texcoords"]):
@@ -128,7 +129,7 @@ def uv_orientation(shape: mi.Shape) -> int:
     edges, turns = points[:, 1:] - points[:, :1], uv[:, 1:] - uv[:, :1]
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     signs = np.sign(turns[:, 0, 0] * turns[:, 1, 1] - turns[:, 0, 1] * turns[:, 1, 0])
-    if len(buffers["vertex_normals"]):  # which a mirrored object keeps, as its winding turns
+    if len(buffers["vertex_normals"]):  # a mirrored object keeps these, but its winding turns
         normals = np.array(buffers["vertex_normals"], np.float64).reshape(-1, 3)[faces].sum(axis=1)
         winding = np.cross(edges[:, 0], edges[:, 1])
         signs *= np.sign(np.einsum("ij,ij->i", winding, normals))
@@ -141,11 +142,11 @@ def uv_orientation(shape: mi.Shape) -> int:
 def doubt_of_green(
     normal_map: NormalMap | None, to_uv: mi.ScalarAffineTransform3f, shapes: list[mi.Shape]
 ) -> str:
-    """A sentence where the normals would fit together on these shapes if green were reversed.
+    """A warning if the map's normals fit together on these shapes only with a reversed green.
 
-    A normal's second component points along v on right-handed UVs and against it on left-handed
-    ones, as the shading frame does; ``to_uv`` may mirror the map once more. The sentence is empty
-    where ``flip_y`` was given, where the shapes disagree, and where nothing speaks for the reverse.
+    The second component of a normal points along v on right-handed UVs, and against v on
+    left-handed ones, as the shading frame does; ``to_uv`` may mirror the map once more. The result
+    is empty if ``flip_y`` was given, if the shapes disagree, or if the normals fit as they are.
     """
     if normal_map is None or normal_map.green_is_given:
         return ""

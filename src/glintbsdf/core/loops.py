@@ -1,10 +1,10 @@
 """Loops that sum, and their derivatives.
 
-A loop of Dr.Jit (1.5) whose sums are differentiable, ``dr.while_loop(…, max_iterations=-1)``, keeps
-the derivatives of its state and of what it gathers. Those of a value that its body uses without
-being given it, and that was computed in a recorded call, as all are in a BSDF inside of an
-integrator's loop, it drops without a word. So :func:`symbolic_loop` finds these values by itself,
-wherever the body keeps them, and makes them part of the state.
+A differentiable loop of Dr.Jit (1.5), ``dr.while_loop(…, max_iterations=-1)``, propagates the
+derivatives of its state and of arrays in memory that its body gathers from. But the body may also
+capture values that are not part of the state, and that were computed in a recorded call. In a BSDF
+inside of an integrator's loop, all values are. Dr.Jit silently drops their derivatives. So
+:func:`symbolic_loop` finds the captured values itself, and makes them part of the state.
 """
 
 from __future__ import annotations
@@ -21,24 +21,31 @@ import drjit as dr
 def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str) -> tuple:
     """Run a loop as part of a kernel: while ``condition(*state)`` holds, ``state = body(*state)``.
 
-    Differentiable in both modes where all of the state that carries derivatives is a sum, only
-    added to, or is left as it is; any other loop belongs in a block of ``dr.suspend_grad``. The
-    body may use any values of the functions around it, and may hold further loops.
+    It is differentiable in both modes if the body only adds to the state variables that carry
+    derivatives, or does not change them. Any other loop belongs in a block of ``dr.suspend_grad``.
+    The body may use any values of the functions around it, and may contain further loops.
 
     Args:
-        state: tuple of Dr.Jit arrays, or containers of them; the result is alike.
-        label: name of the loop in what Dr.Jit reports.
+        state: tuple of Dr.Jit arrays, or containers of them.
+        condition: function of the state that returns an ``mi.Bool``.
+        body: function of the state that returns the new state.
+        label: name of the loop in Dr.Jit's messages.
+
+    Returns:
+        The final state, a tuple like ``state``.
     """
     captured = Captured(body)
     width, count = dr.width((*state, *captured.values)), len(state)
-    # Of one width: in nested loops, Dr.Jit cannot sum up the derivatives of a narrower one.
+    # All values get one width: in nested loops, Dr.Jit cannot sum the derivatives of a narrower
+    # one.
     values = [value + dr.zeros(type(value), width) for value in captured.values]
 
     def body_with_values(*state):
         state, values = state[:count], state[count:]
         return *captured.function_with(values)(*state), *values
 
-    # Mitsuba switches symbolic loops off to differentiate, and Dr.Jit warns of each in a call.
+    # The mode is explicit: Mitsuba switches symbolic loops off when it differentiates, and Dr.Jit
+    # then warns of every loop in a call.
     return dr.while_loop(
         (*state, *values),
         lambda *state: condition(*state[:count]),
@@ -50,11 +57,11 @@ def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str)
 
 
 class Captured:
-    """The arrays with derivatives that a function uses without being given them.
+    """The arrays with derivatives that a function captures.
 
-    They are looked for in the variables of enclosing functions, in the objects and the functions
-    that these hold, and so on. Arrays in memory stay where they are: Dr.Jit does not lose them, and
-    those that are gathered from have sizes of their own.
+    They are searched in the variables of enclosing functions, in the objects and functions that
+    these refer to, and so on. Evaluated arrays, which are in memory, are left out: Dr.Jit keeps
+    their derivatives, and arrays to gather from have sizes of their own.
 
     Attributes:
         values (list): the arrays.
@@ -75,7 +82,7 @@ class Captured:
         mapped(function, find, {})
 
     def function_with(self, values) -> Callable:
-        """The function, using these ``values`` in place of its own."""
+        """A copy of the function that uses ``values`` in place of the captured arrays."""
 
         def replace(array):
             place = self.places.get(identity(array))
@@ -85,24 +92,24 @@ class Captured:
 
 
 def identity(array) -> tuple[int, int]:
-    """The same for arrays that are one and the same variable, with the same derivatives."""
+    """A key that is equal for arrays that are the same variable with the same derivatives."""
     return array.index, array.index_ad
 
 
 # ------------------------------------------------------------------------------------------------
-#  Going through what a function uses
+#  Traversal of everything that a function refers to
 # ------------------------------------------------------------------------------------------------
 
 
 def mapped(thing: Any, replace: Callable, done: dict) -> Any:
     """``thing`` with ``replace`` applied to all arrays in it: itself if none changes, else a copy.
 
-    Looks into containers, functions and their enclosing variables, objects and their attributes.
-    ``done``: what has been met so far, by identity, and what became of it.
+    It looks into containers, functions and their enclosing variables, objects and their attributes.
+    ``done`` maps the identity of each object met so far to the object and its replacement.
     """
     if id(thing) in done:
         return done[id(thing)][1]
-    done[id(thing)] = thing, thing  # the first keeps the identity from being used again
+    done[id(thing)] = thing, thing  # while the first is alive, no other object gets its identity
     if dr.is_array_v(thing) and dr.depth_v(thing) == 1 and not dr.is_tensor_v(thing):
         result = replace(thing)
     else:
@@ -115,7 +122,7 @@ def mapped(thing: Any, replace: Callable, done: dict) -> Any:
 
 
 def taken_apart(thing: Any) -> tuple[list, Callable]:
-    """The parts of a thing, and the function that makes its like of other parts."""
+    """The parts of an object, and a function that makes a copy of it with other parts."""
     kind = type(thing)
     if dr.is_array_v(thing):
         parts = [] if dr.is_tensor_v(thing) else list(thing)
@@ -132,7 +139,7 @@ def taken_apart(thing: Any) -> tuple[list, Callable]:
         )
     if kind is FunctionType:
         return function_taken_apart(thing)
-    fields = getattr(kind, "DRJIT_STRUCT", None)  # of Mitsuba's interactions, for example
+    fields = getattr(kind, "DRJIT_STRUCT", None)  # Mitsuba's interactions, for example, have it
     if fields and not isinstance(thing, type):
         parts = [getattr(thing, name) for name in fields]
         return parts, lambda new: with_attributes(kind(thing), zip(fields, new, strict=True))
@@ -171,8 +178,8 @@ def is_set(cell: CellType) -> bool:
 
 
 def keeps_attributes(thing: object) -> bool:
-    """Whether an object's state is its attributes of Python: not so with plugins of Mitsuba, the
-    other half of which is written in C++, nor with classes and modules."""
+    """Whether the whole state of an object is in its Python attributes. This is not so for plugins
+    of Mitsuba, which have a part in C++, nor for classes and modules."""
     return (
         hasattr(thing, "__dict__")
         and not isinstance(thing, type | ModuleType)
@@ -181,14 +188,14 @@ def keeps_attributes(thing: object) -> bool:
 
 
 def with_items(thing, items):
-    """``thing``, once these items have been set."""
+    """Set these items of ``thing``, and return it."""
     for key, value in items:
         thing[key] = value
     return thing
 
 
 def with_attributes(thing, attributes):
-    """``thing``, once these attributes have been set."""
+    """Set these attributes of ``thing``, and return it."""
     for name, value in attributes:
         object.__setattr__(thing, name, value)
     return thing

@@ -1,10 +1,10 @@
-"""Small lights: those that are asked at every hit, and integrated by the BSDF itself.
+"""Small lights: emitters that are sampled at every hit, and that a BSDF can integrate itself.
 
-A light of angular covariance Σ_ω about its centre is split as a pixel is (notes in
-:mod:`~glintbsdf.footprint.pixel_filter`): a share of Σ_ω becomes a spread of normals, over which a
-P-NDF averages in closed form, and the rest is sampled, by directions to points of the light that
-are contracted towards its centre. Visibility and radiance are those of the points themselves, so
-that a light that is textured, or hidden in part, keeps its mean.
+Seen from a point, the directions to a light have a covariance Σ_ω about its centre. It is split as
+the variance of a pixel's filter is (:mod:`~glintbsdf.footprint.pixel_filter`). A share of Σ_ω
+becomes a spread of normals, over which a P-NDF averages in closed form. The rest is sampled:
+directions to points of the light are contracted towards its centre. Visibility and radiance are
+taken at the points themselves. So a light that is textured, or partly hidden, keeps its mean.
 """
 
 from __future__ import annotations
@@ -15,33 +15,35 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: So many emitters are asked at every hit, at most: those of the greatest power. Of the others, one
-#: chosen at random.
-MOST = 16
+#: Largest number of emitters that are sampled at every hit: the most powerful ones. Of the others,
+#: one is chosen at random.
+MAX_SAMPLED = 16
 
-#: Standard deviation of directions (radians) up to which a light is small: that of a disk of 0.5.
-#: Wider ones are found by BSDF sampling as well as by themselves.
-SMALL = 0.25
+#: A light is small if the standard deviation of the directions to it (radians) is at most this: a
+#: disk with a radius of 0.5 radians. Larger lights are sampled by the emitter and by the BSDF.
+MAX_DEVIATION = 0.25
 
-#: Emitters up to which it pays to look at all of them to save a BSDF sample.
-FEW = 8
+#: With at most this many emitters, it is worth checking all of them to save a BSDF sample.
+MAX_CHECKED = 8
 
-#: Rays by which the power of an emitter is estimated.
+#: Number of rays that estimate the power of an emitter.
 POWER_RAYS = 64
 
-#: Points by which the extent of an emitter of any shape is measured, along each axis.
+#: Number of points along each axis that measure the extent of an emitter of any shape.
 EXTENT_POINTS = 32
 
 
 @dataclass
 class View:
-    """A light as it is seen from a place.
+    """A light as it is seen from a point.
 
     Attributes:
         d (mi.Vector3f): unit direction to its centre.
-        x, y (mi.Vector3f): unit vectors across d, the principal axes of its directions.
-        variance_x, variance_y (mi.Float): variances of its directions along these, radians².
-        small (mi.Bool): whether it has extent, and both variances are below :data:`SMALL` squared.
+        x, y (mi.Vector3f): unit vectors perpendicular to d, the principal axes of the directions to
+            the light.
+        variance_x, variance_y (mi.Float): variances of these directions along x and y, radians².
+        small (mi.Bool): whether the light has extent, and both variances are below the square of
+            :data:`MAX_DEVIATION`.
     """
 
     d: mi.Vector3f
@@ -52,33 +54,35 @@ class View:
     small: mi.Bool
 
     def spread(self, share: mi.Float) -> mi.Float:
-        """The variance (radians²) that a share of the light has in every direction: of a stretched
-        light no more than its lesser axis has. Zero for a light that is not small."""
+        """The isotropic variance (radians²) that the BSDF integrates: the ``share`` of the smaller
+        variance of the light. It is 0 for a light that is not small."""
         return dr.select(self.small, share * dr.minimum(self.variance_x, self.variance_y), 0)
 
     def contracted(self, d: mi.Vector3f, spread: mi.Float) -> mi.Vector3f:
-        """The direction ``d`` to a point of the light, moved towards the centre so far that
-        directions vary by ``spread`` less."""
+        """The direction ``d`` to a point of the light, contracted towards the centre, so that the
+        variance of directions is smaller by ``spread`` (radians²)."""
         offset = d - self.d
         x, y = dr.dot(offset, self.x), dr.dot(offset, self.y)
         for axis, along, variance in ((self.x, x, self.variance_x), (self.y, y, self.variance_y)):
-            left = dr.safe_sqrt(1 - spread / dr.maximum(variance, 1e-20))
-            offset = offset + axis * (along * (left - 1))
+            factor = dr.safe_sqrt(1 - spread / dr.maximum(variance, 1e-20))
+            offset = offset + axis * (along * (factor - 1))
         return dr.select(spread > 0, dr.normalize(self.d + offset), d)
 
 
 class SmallLights:
-    """The emitters of a scene: those asked at every hit, and the others.
+    """The emitters of a scene, and how they are sampled.
 
     Args:
         scene (mi.Scene): the scene.
-        every (bool): whether emitters are asked at every hit, :data:`MOST` at most; else none is.
-        extents (bool): whether the lights' extents are of interest; else none is small.
+        every (bool): whether up to :data:`MAX_SAMPLED` emitters are sampled at every hit; otherwise
+            none is.
+        extents (bool): whether to measure the extents of lights; otherwise none counts as small.
 
     Attributes:
-        asked (mi.EmitterPtr): the emitters asked at every hit, ``asked_count`` of them.
-        others (mi.EmitterPtr): those of which one is chosen, in proportion to their
-            ``sampling_weight``; ``others_count`` of them.
+        sampled (mi.EmitterPtr): the ``sampled_count`` emitters that are sampled at every hit.
+        others (mi.EmitterPtr): the ``others_count`` emitters of which one is chosen, in proportion
+            to its ``sampling_weight``.
+        probability (mi.Float): probability to be sampled at a hit, by :meth:`registry_index`.
     """
 
     def __init__(self, scene: mi.Scene, every: bool = True, extents: bool = True) -> None:
@@ -88,19 +92,19 @@ class SmallLights:
         bounded = [
             k for k, emitter in enumerate(emitters) if not emitter.is_environment() and weights[k]
         ]
-        strongest = most_powerful(emitters, bounded, MOST) if every or extents else []
-        asked = strongest if every else []
-        others = [k for k in range(len(emitters)) if k not in asked and weights[k]]
-        self.asked_count, self.others_count, self.extents = len(asked), len(others), extents
+        strongest = most_powerful(emitters, bounded, MAX_SAMPLED) if every or extents else []
+        sampled = strongest if every else []
+        others = [k for k in range(len(emitters)) if k not in sampled and weights[k]]
+        self.sampled_count, self.others_count, self.extents = len(sampled), len(others), extents
 
         def chosen(indices):
             return dr.gather(mi.EmitterPtr, pointers, mi.UInt32(indices)) if indices else None
 
-        self.asked, self.others = chosen(asked), chosen(others)
+        self.sampled, self.others = chosen(sampled), chosen(others)
         if others:
             self.distribution = mi.DiscreteDistribution(mi.Float(weights[others]))
 
-        # What is known of an emitter is found by its number in Mitsuba's registry; 0 is none.
+        # Data of emitters are arrays over their indices in Dr.Jit's registry; 0 is no emitter.
         names = mi.UInt32(dr.reinterpret_array(mi.UInt32, pointers)).numpy().astype(int)
         size = names.max(initial=0) + 1
         probability, small = np.zeros(size, np.float32), np.zeros(size, bool)
@@ -108,7 +112,7 @@ class SmallLights:
         delta = np.array(
             [bool(emitter.flags() & mi.EmitterFlags.Delta) for emitter in emitters], bool
         )
-        probability[names[asked]] = 1
+        probability[names[sampled]] = 1
         probability[names[others]] = weights[others] / max(weights[others].sum(), 1e-30)
         for k in strongest if extents else []:
             found = extent(emitters[k])
@@ -117,33 +121,35 @@ class SmallLights:
                 centre[names[k]], axes[names[k]] = found
         self.probability = mi.Float(probability)
         self.extended = mi.Bool(small)
-        #: Whether all emitters are asked, and all of them may be small: then BSDF sampling finds
-        #: none that emitter sampling does not.
-        self.complete = every and not others and bool(np.all(small[names[asked]] | delta[asked]))
+        #: Whether all emitters are sampled at every hit, and all are points or may be small. BSDF
+        #: sampling is then needed for none of them.
+        self.complete = (
+            every and not others and bool(np.all(small[names[sampled]] | delta[sampled]))
+        )
         self.centre = mi.Float(centre.ravel())
         self.axes = mi.Float(axes.ravel())
 
     def all_small(self, p: mi.Point3f) -> mi.Bool:
-        """Where, seen from ``p``, no emitter is left for BSDF sampling: all are small or points."""
-        if not self.complete or self.asked_count > FEW:
+        """Whether all emitters are points, or small as seen from ``p``, so that none of them needs
+        BSDF sampling."""
+        if not self.complete or self.sampled_count > MAX_CHECKED:
             return mi.Bool(False)
         result = mi.Bool(True)
-        for k in range(self.asked_count):
-            emitter = dr.gather(mi.EmitterPtr, self.asked, mi.UInt32(k))
-            name = self.name(emitter)
-            extended = dr.gather(mi.Bool, self.extended, name)
+        for k in range(self.sampled_count):
+            emitter = dr.gather(mi.EmitterPtr, self.sampled, mi.UInt32(k))
+            extended = dr.gather(mi.Bool, self.extended, self.registry_index(emitter))
             result &= self.view(emitter, p).small | ~extended
         return result
 
-    def name(self, emitter: mi.EmitterPtr) -> mi.UInt32:
-        """The number by which an emitter is looked up; 0 where there is none."""
+    def registry_index(self, emitter: mi.EmitterPtr) -> mi.UInt32:
+        """The index of an emitter in Dr.Jit's registry; 0 where there is none."""
         return dr.reinterpret_array(mi.UInt32, emitter)
 
     def choose(
         self, random: mi.Point2f, active: bool | mi.Bool = True
     ) -> tuple[mi.EmitterPtr, mi.Float, mi.Point2f]:
-        """Choose one of the ``others``: the emitter, its probability, and what is left of
-        ``random`` to sample it with."""
+        """Choose one of the ``others``: returns the emitter, its probability, and random numbers
+        made of ``random`` to sample it with."""
         index, x, probability = self.distribution.sample_reuse_pmf(random.x, active)
         emitter = dr.gather(mi.EmitterPtr, self.others, index, active)
         return emitter, probability, mi.Point2f(x, random.y)
@@ -156,16 +162,16 @@ class SmallLights:
         active: bool | mi.Bool = True,
     ) -> mi.Float:
         """The density (1/sr) with which emitter sampling at ``si`` draws ``ds``."""
-        if self.asked_count == 0:
+        if self.sampled_count == 0:
             return scene.pdf_emitter_direction(si, ds, active)
-        probability = dr.gather(mi.Float, self.probability, self.name(ds.emitter), active)
+        probability = dr.gather(mi.Float, self.probability, self.registry_index(ds.emitter), active)
         return ds.emitter.pdf_direction(si, ds, active) * probability
 
     def view(self, emitter: mi.EmitterPtr, p: mi.Point3f, active: bool | mi.Bool = True) -> View:
-        """How an emitter is seen from ``p``."""
-        name = self.name(emitter)
-        small = dr.gather(mi.Bool, self.extended, name, active)
-        to_centre = dr.gather(mi.Vector3f, self.centre, name, active) - mi.Vector3f(p)
+        """An emitter as it is seen from ``p``."""
+        index = self.registry_index(emitter)
+        small = dr.gather(mi.Bool, self.extended, index, active)
+        to_centre = dr.gather(mi.Vector3f, self.centre, index, active) - mi.Vector3f(p)
         distance = dr.norm(to_centre)
         small &= distance > 0
         inverse = dr.select(small, dr.rcp(distance), 0)
@@ -173,16 +179,16 @@ class SmallLights:
         s, t = mi.coordinate_system(d)
         xx, xy, yy = mi.Float(0), mi.Float(0), mi.Float(0)
         for k in range(3):
-            axis = dr.gather(mi.Vector3f, self.axes, 3 * name + k, active) * inverse
+            axis = dr.gather(mi.Vector3f, self.axes, 3 * index + k, active) * inverse
             x, y = dr.dot(axis, s), dr.dot(axis, t)
             xx, xy, yy = dr.fma(x, x, xx), dr.fma(x, y, xy), dr.fma(y, y, yy)
         half = 0.5 * (xx - yy)
         radius = dr.safe_sqrt(dr.fma(half, half, xy * xy))
         mean = 0.5 * (xx + yy)
-        # The greater axis, by the half angle of (half, xy); any axis of a round light.
+        # The major axis has half the polar angle of (half, xy); for a round light any axis will do.
         angle = 0.5 * dr.atan2(xy, half)
         sine, cosine = dr.sincos(angle)
-        small &= (mean + radius < SMALL**2) & (mean - radius > 0)
+        small &= (mean + radius < MAX_DEVIATION**2) & (mean - radius > 0)
         return View(
             d,
             s * cosine + t * sine,
@@ -194,7 +200,7 @@ class SmallLights:
 
 
 def most_powerful(emitters: list, indices: list[int], most: int) -> list[int]:
-    """Of the emitters with these indices the ``most`` of the greatest power, in their order."""
+    """Those of the ``indices`` that belong to the ``most`` most powerful emitters, in order."""
     if len(indices) <= most:
         return indices
     powers = [power(emitters[k]) for k in indices]
@@ -203,7 +209,7 @@ def most_powerful(emitters: list, indices: list[int], most: int) -> list[int]:
 
 
 def power(emitter: mi.Emitter) -> float:
-    """The power that an emitter sends into the scene, by an estimate."""
+    """An estimate of the power that an emitter sends into the scene."""
     random = np.random.default_rng(0).random((5, POWER_RAYS), dtype=np.float32)
     _, weight = emitter.sample_ray(
         0.0, mi.Float(random[0]), mi.Point2f(random[1:3]), mi.Point2f(random[3:5])
@@ -214,10 +220,10 @@ def power(emitter: mi.Emitter) -> float:
 
 
 def extent(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray] | None:
-    """The centre of an emitter's surface (3), and three vectors (3×3, rows) whose outer products
-    add up to the covariance of its points as they are seen from afar.
+    """The centre of an emitter's surface (3), and three vectors (the rows, 3×3) whose outer
+    products add up to the covariance of its points, as they are seen from afar.
 
-    None where there is no surface, or no finite one.
+    None for an emitter without a surface, or without a finite one.
     """
     shape = emitter.get_shape()
     if shape is None:
@@ -226,7 +232,8 @@ def extent(emitter: mi.Emitter) -> tuple[np.ndarray, np.ndarray] | None:
     if shape.class_name() == "Sphere":
         centre = 0.5 * (np.array(box.min) + np.array(box.max))
         radius = 0.5 * (np.array(box.max) - np.array(box.min))
-        # From afar a sphere is a disk, whose points have a quarter of the squared radius.
+        # From afar a sphere is a disk. The variance of its points is a quarter of the squared
+        # radius.
         return centre, np.diag(0.5 * radius)
     u, v = (g.ravel() for g in np.meshgrid(*[(np.arange(EXTENT_POINTS) + 0.5) / EXTENT_POINTS] * 2))
     sample = mi.Point2f(u.astype(np.float32), v.astype(np.float32))

@@ -104,7 +104,7 @@ def sums_of_samples(
             border = reach(film)
         else:
             values = colours(film, radiance * weight, valid, ray.wavelengths)
-            channels, border = shared.weighed(sign, values, aovs), 0
+            channels, border = shared.channels(sign, values, aovs), 0
         offset = position - mi.Vector2f(dr.floor(position))
         dr.eval(channels, offset)
         del ray, weight, radiance, valid, aovs, sampler, position
