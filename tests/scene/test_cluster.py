@@ -299,7 +299,7 @@ def test_addresses():
 
 @pytest.mark.parametrize("address, warned", [("127.0.0.1", False), ("192.0.2.1", True)])
 def test_a_warning_without_tls(address, warned, monkeypatch):
-    monkeypatch.setattr(clusters, "PATIENCE", 0.2)
+    monkeypatch.setattr(clusters, "TIMEOUT", 0.2)
     told = []
     with pytest.raises(ClusterError):
         Cluster.at(f"{address}:{closed_port()}", tell=told.append).__enter__()

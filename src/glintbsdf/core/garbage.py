@@ -6,10 +6,10 @@ import gc
 
 
 def collect_former_scenes() -> None:
-    """Free the BSDFs of former scenes that are left in reference cycles; for whoever is about to
-    load or to render a scene.
+    """Free BSDFs of older scenes that are left in reference cycles.
 
-    Dr.Jit records a call of every BSDF that is alive. Were one freed by Python's collector while
-    that goes on, Dr.Jit would follow a pointer to nothing.
+    It must be called before a scene is loaded or rendered. Dr.Jit records calls of all BSDFs that
+    exist. If Python's garbage collector freed one of them during the recording, Dr.Jit would follow
+    a dangling pointer.
     """
     gc.collect()

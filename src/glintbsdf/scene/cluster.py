@@ -1,13 +1,13 @@
-"""Units rendered by many processes, on this machine or on many, through Dask.
+"""Rendering of units by many processes, on one or on many machines, through Dask.
 
-A worker is sent a unit and the description of its image. It checks that its versions are the same,
-says which files of the scene it lacks, loads the scene once, and returns the sums of the unit. The
-client holds no more units than workers can be busy with, so neither it nor the scheduler grows with
-the number of units. Dask gives the units of a worker that has died to others; which worker made
-what does not show in the image.
+The client sends a worker a unit and the description of its image. The worker checks that its
+versions are the same, and says which files of the scene it lacks. It loads the scene once, and
+returns the sums of the unit. The client submits only as many units as keep the workers busy, so the
+memory of client and scheduler does not grow with the number of units. If a worker dies, Dask gives
+its units to others. The image does not depend on which worker rendered a unit.
 
-Workers run whatever their scheduler sends: who can reach it can do what the workers can. A local
-cluster listens on loopback only; across machines use TLS.
+Workers run whatever their scheduler sends. So everybody who can reach the scheduler can do what the
+workers can. A local cluster listens on loopback only; across machines use TLS.
 """
 
 from __future__ import annotations
@@ -51,23 +51,24 @@ if TYPE_CHECKING:
     from distributed import Client, Future
     from distributed.scheduler import KilledWorker
 
-#: Seconds until a scheduler must have answered.
-PATIENCE = 8.0
+#: Seconds within which a scheduler must answer.
+TIMEOUT = 8.0
 
-#: Units under way for each worker: one that it renders, and one that it will.
-AHEAD = 2
+#: Number of submitted units per worker: one that it renders, and one that waits.
+UNITS_PER_WORKER = 2
 
-#: Scenes that a worker keeps loaded: frames of a sequence follow each other.
+#: Number of scenes that a worker keeps loaded: this one and the next frame of a sequence.
 SCENES = 2
 
-#: Environment variable of a worker: threads that it renders with, where they are not Dask's.
+#: Environment variable with the number of rendering threads of a worker, if it is not Dask's
+#: number.
 THREADS = "GLINTBSDF_THREADS"
 
-#: How often a unit that needs too much memory is halved.
+#: How many times a unit that needs too much memory may be halved.
 HALVINGS = 2
 
-#: How often a unit that workers have died of is given out again, where Dask does not know that they
-#: lacked memory. Dask itself does so once or more each time.
+#: How many times a unit is submitted again after the death of a worker, unless Dask knows that the
+#: worker ran out of memory. Each time, Dask itself retries at least once.
 TRIALS = 2
 
 
@@ -75,20 +76,20 @@ GONE = "the scheduler is gone; with --checkpoint the same command goes on from w
 
 
 class ClusterError(RuntimeError):
-    """Something is the matter with the scheduler or its workers; the message says what."""
+    """The scheduler or a worker has failed; the message says how."""
 
 
 # ------------------------------------------------------------------------------------------------
 #  On a worker
 # ------------------------------------------------------------------------------------------------
 
-_lock = threading.RLock()  # Mitsuba's variant and Dr.Jit's threads are those of the process
+_lock = threading.RLock()  # a process has one variant of Mitsuba and one pool of threads
 _loaded: OrderedDict[Job, tuple[Renderer, ExitStack]] = OrderedDict()
 
 
 @atexit.register
 def _forget() -> None:
-    """Let go of what is loaded, as long as there is a Mitsuba to do it."""
+    """Free all loaded scenes; at exit, before Mitsuba is gone."""
     while _loaded:
         _, (_, stack) = _loaded.popitem()
         stack.close()
@@ -96,13 +97,13 @@ def _forget() -> None:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a worker returns for a unit.
+    """The result of a worker for a unit.
 
     Attributes:
-        worker (str): its address.
-        missing (tuple[Content, ...]): files that it must be sent first.
-        tile, sums: what :func:`.sums_of_samples` returns for the unit, where nothing was missing.
-        trimmed_too_far (bool): structures had to be built in full.
+        worker (str): address of the worker.
+        missing (tuple[Content, ...]): files that the worker lacks; there is no result then.
+        tile, sums: the result of :func:`.sums_of_samples` for the unit.
+        trimmed_too_far (bool): whether trimmed structures did not suffice, and were built in full.
     """
 
     worker: str
@@ -113,14 +114,14 @@ class Answer:
 
     @property
     def part(self) -> tuple[Tile, np.ndarray]:
-        """Tile and sums of a unit of which nothing was missing."""
+        """Tile and sums of the unit; no file may have been missing."""
         if self.tile is None or self.sums is None:
             raise ValueError("the worker has not rendered the unit: files were missing")
         return self.tile, self.sums
 
 
 class _Call:
-    """An object that calls a function where it is unpickled."""
+    """An object whose unpickling calls a function."""
 
     def __init__(self, function: Callable, *arguments: object) -> None:
         self.call = function, arguments
@@ -130,10 +131,10 @@ class _Call:
 
 
 def packed(job: Job, unit: Unit) -> bytes:
-    """A task for Dask: unpickling it runs :func:`work`.
+    """A task for Dask, whose unpickling runs :func:`work`.
 
-    A worker without this package, or with another version, can receive it and fail with a sentence.
-    A task that it cannot read would end it, again and again.
+    A worker without this package, or with another version, can receive these bytes and fail with a
+    clear message. A task that it cannot unpickle at all would end one worker after the other.
     """
     return pickle.dumps(_Call(work, versions(), pickle.dumps((job, unit))))
 
@@ -142,12 +143,12 @@ def work(expected: dict[str, str], task: bytes) -> Answer:
     """Render a unit, on a worker.
 
     Args:
-        expected: versions that the worker must have.
+        expected: the versions that the worker must have.
         task: the pickled job and unit.
 
     Raises:
-        ClusterError: the worker has other versions, or lacks what the variant needs.
-        MemoryError: the worker has not enough memory.
+        ClusterError: the worker has other versions, or cannot run the variant.
+        MemoryError: the worker has too little memory.
     """
     from distributed import get_worker
 
@@ -175,13 +176,13 @@ def work(expected: dict[str, str], task: bytes) -> Answer:
 
 
 def renderer_sufficed(renderer: Renderer) -> bool:
-    """Whether the structures of a renderer, if they are trimmed, have been enough so far."""
+    """Whether the trimmed structures of a renderer have sufficed so far; true without trimming."""
     trimmed = getattr(renderer.missed, "__self__", None)
     return not isinstance(trimmed, Trimmed) or trimmed.sufficed
 
 
 def _renderer(job: Job, store: Store, threads: int) -> Renderer:
-    """The scene of a job, loaded at its first unit."""
+    """The renderer of a job, whose scene is loaded with its first unit."""
     if job in _loaded:
         _loaded.move_to_end(job)
         return _loaded[job][0]
@@ -209,8 +210,8 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
 
 @contextlib.contextmanager
 def _spare_thread(threads: int) -> Iterator[None]:
-    """Give Dr.Jit two threads at least in the block, which Mitsuba needs to read OpenEXR files;
-    after the block, as many as are given."""
+    """A context in which Dr.Jit has at least two threads, as Mitsuba needs them to read OpenEXR
+    files. After it, Dr.Jit has ``threads`` threads."""
     dr.set_thread_count(max(2, threads))
     try:
         yield
@@ -219,13 +220,13 @@ def _spare_thread(threads: int) -> Iterator[None]:
 
 
 def dask_setup(worker: object) -> None:
-    """Called by Dask in each process of a local cluster: a terminal sends Ctrl-C to all processes,
-    and the one that knows what is done decides."""
+    """Ignore Ctrl-C; Dask calls this in each process of a local cluster. A terminal sends Ctrl-C to
+    all processes, but only the client decides what to do."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def receive(content: Content, offset: int, piece: bytes, last: bool, dask_worker=None) -> None:
-    """Take a piece of a file, on a worker. See :meth:`.Store.receive`."""
+    """Receive a piece of a file, on a worker. See :meth:`.Store.receive`."""
     Store(Path(dask_worker.local_directory) / "glintbsdf-files").receive(
         content, offset, piece, last
     )
@@ -238,8 +239,7 @@ def receive(content: Content, offset: int, piece: bytes, last: bool, dask_worker
 
 @dataclass(frozen=True)
 class Keys:
-    """Files for TLS, as Dask names them: certificates of the authority and of this client, and its
-    private key."""
+    """Files for TLS: the certificates of the authority and of this client, and its private key."""
 
     ca_file: Path
     cert: Path
@@ -266,14 +266,14 @@ class Cluster:
         variant: str = "",
         tell: Callable[[str], None] = warnings.warn,
     ) -> Cluster:
-        """Processes on this machine that share its cores, reachable from this machine only.
+        """Processes on this machine that share its cores. Other machines cannot reach them.
 
         Args:
             workers: number of processes.
-            memory_limit: memory that each process may take, such as ``4GB``; a process beyond it
-                is ended. ``auto``: its part of the machine's memory.
-            variant: variant of Mitsuba; on GPUs each worker gets one GPU.
-            tell: is called with what happens meanwhile, in words.
+            memory_limit: memory that each process may use, such as ``4GB``; a process that uses
+                more is ended. ``auto``: its part of the machine's memory.
+            variant: variant of Mitsuba; with CUDA each worker gets one GPU.
+            tell: function that is called with messages for the user.
         """
 
         def open_client(stack: ExitStack) -> Client:
@@ -322,16 +322,17 @@ class Cluster:
         keys: Keys | None = None,
         tell: Callable[[str], None] = warnings.warn,
     ) -> Cluster:
-        """The workers of a scheduler that runs already.
+        """The workers of a running scheduler.
 
         Args:
-            address: such as ``tcp://host:8786``, or ``tls://host:8786``; the scheme may be left
+            address: for example ``tcp://host:8786`` or ``tls://host:8786``; the scheme may be left
                 out.
             keys: files for TLS.
-            tell: is called with what happens meanwhile, in words.
+            tell: function that is called with messages for the user.
 
         Raises:
-            ClusterError: on entering, if no scheduler answers, or its workers have another version.
+            ClusterError: the address is wrong; or, when the context is entered, no scheduler
+                answers, or its workers have another version.
         """
         scheme, separator, rest = address.rpartition("://")
         scheme = scheme if separator else ("tls" if keys else "tcp")
@@ -359,7 +360,7 @@ class Cluster:
                     "run programs on the workers. See --tls-ca-file."
                 )
             return stack.enter_context(
-                Client(f"{scheme}://{rest}", timeout=PATIENCE, security=security)
+                Client(f"{scheme}://{rest}", timeout=TIMEOUT, security=security)
             )
 
         return cls(open_client, tell)
@@ -382,10 +383,10 @@ class Cluster:
         self._stack.close()
 
     def _check_versions(self) -> None:
-        """Raise unless all workers that are there have this package, in these versions."""
+        """Raise :class:`ClusterError` unless all workers have this package, in these versions."""
         import importlib.metadata
 
-        # Without this package a worker could not even read a question that is part of it.
+        # A worker without this package could not unpickle a function of this package.
         installed = self.client.run(importlib.metadata.version, "glintbsdf", on_error="return")
         for address, answer in installed.items():
             if isinstance(answer, Exception):
@@ -399,7 +400,7 @@ class Cluster:
 
     @property
     def worker_count(self) -> int:
-        """Workers that are there now."""
+        """Number of workers at the moment."""
         return len(self.client.nthreads())
 
     def __str__(self) -> str:
@@ -407,24 +408,24 @@ class Cluster:
         return f"{count} worker" + ("s" if count != 1 else "")
 
     def render_all(self, job: Job) -> Callable[[Iterator[Unit]], Results]:
-        """What renders the units of a job, for :func:`~glintbsdf.scene.rendering.produce`.
+        """A function that renders units of a job, for :func:`~glintbsdf.scene.rendering.produce`.
 
         Raises:
-            ClusterError: raised by its iterator, if the scheduler is gone, a worker has another
-                version, or no worker has the memory that a unit needs.
+            ClusterError: while the results are iterated: the scheduler is gone, a worker has
+                another version, or no worker has enough memory for a unit.
         """
         return lambda units: _Rendering(self, job).results(units)
 
 
-#: Settings of Dask for a local cluster: memory is for rendering, not for keeping results, and a
-#: worker whose kernels take long is not dead.
+#: Settings of Dask for a local cluster. Memory is for rendering, not for results. A worker is not
+#: dead only because a kernel takes long.
 _LOCAL_SETTINGS = {
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
     "distributed.scheduler.allowed-failures": 1,
-    # A unit that waits at a worker is not suspected of its death.
+    # Units wait at the scheduler, not at workers: Dask would suspect them of a worker's death.
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.scheduler.worker-ttl": None,
     "distributed.admin.tick.limit": "1h",
@@ -432,25 +433,26 @@ _LOCAL_SETTINGS = {
 
 
 @dataclass(frozen=True)
-class _Errand:
-    """A unit that is under way, or a part of one that was halved."""
+class _Task:
+    """A submitted unit, or a part of a unit that was halved."""
 
     unit: Unit
-    place: tuple[int, ...]  # 0 or 1 for each time that it was halved
+    place: tuple[int, ...]  # which half (0 or 1), for each time that the unit was halved
 
 
 class _Rendering:
-    """Units of a job under way on a cluster."""
+    """The units of a job that are submitted to a cluster."""
 
     def __init__(self, cluster: Cluster, job: Job) -> None:
         self.cluster, self.client, self.job = cluster, cluster.client, job
-        self.flying: dict[Future, _Errand] = {}
+        self.pending: dict[Future, _Task] = {}
         self.halves: dict[int, dict[tuple[int, ...], tuple[Tile, np.ndarray]]] = {}
         self.sent: Counter[tuple[str, Content]] = Counter()
-        self.deaths: Counter[_Errand] = Counter()
-        self.told: set[str] = set()
+        self.deaths: Counter[_Task] = Counter()
+        self.messages: set[str] = set()
 
     def results(self, units: Iterator[Unit]) -> Results:
+        """Submit units, and yield them when they are done."""
         units = iter(units)
         alive, ended = time.monotonic(), False
         try:
@@ -461,51 +463,51 @@ class _Rendering:
                     alive = time.monotonic()
                 elif time.monotonic() - alive > 10:
                     self.tell_once("there is no worker; waiting for one")
-                while not ended and len(self.flying) < AHEAD * max(1, workers):
+                while not ended and len(self.pending) < UNITS_PER_WORKER * max(1, workers):
                     unit = next(units, None)
                     if unit is None:
                         ended = True
                     else:
-                        self.submit(_Errand(unit, ()))
-                if not self.flying:
+                        self.submit(_Task(unit, ()))
+                if not self.pending:
                     return
-                done = self.landed()
+                done = self.completed()
                 if not done:
                     yield None
                 for future in done:
                     yield self.received(future)
         finally:
             with contextlib.suppress(Exception):
-                self.client.cancel(list(self.flying), force=True)
+                self.client.cancel(list(self.pending), force=True)
 
-    def landed(self) -> list[Future]:
-        """Futures that have come to an end; none where a second passes without any."""
+    def completed(self) -> list[Future]:
+        """Futures that have ended; an empty list if none ends within a second."""
         from distributed import wait
 
         with _connected():
             try:
-                done = wait(list(self.flying), timeout=1, return_when="FIRST_COMPLETED").done
+                done = wait(list(self.pending), timeout=1, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 return []
-        return sorted(done, key=lambda future: self.flying[future].unit.index)
+        return sorted(done, key=lambda future: self.pending[future].unit.index)
 
-    def submit(self, errand: _Errand) -> None:
-        # The first units are the first to be merged.
+    def submit(self, task: _Task) -> None:
+        """Submit a task. Units that are merged first have the highest priority."""
         with _connected():
             future = self.client.submit(
                 pickle.loads,
-                packed(self.job, errand.unit),
-                key=f"unit-{errand.unit.index}-{uuid.uuid4().hex}",
-                priority=-errand.unit.index,
+                packed(self.job, task.unit),
+                key=f"unit-{task.unit.index}-{uuid.uuid4().hex}",
+                priority=-task.unit.index,
                 pure=False,
             )
-        self.flying[future] = errand
+        self.pending[future] = task
 
     def received(self, future: Future) -> tuple[Unit, Tile, np.ndarray] | None:
-        """What has become of an errand: a unit that is done, or None if there is more to do."""
-        errand = self.flying.pop(future)
+        """Handle the end of a task. Returns a unit that is done, or None if there is more to do."""
+        task = self.pending.pop(future)
         if future.status == "error":
-            self.failed(errand, future.exception())
+            self.failed(task, future.exception())
             return None
         if future.status != "finished":
             raise ClusterError(GONE)
@@ -513,15 +515,15 @@ class _Rendering:
             answer = future.result()
         if answer.missing:
             self.send(answer)
-            self.submit(errand)
+            self.submit(task)
             return None
         if answer.trimmed_too_far:
             self.tell_once("trimmed structures did not suffice: built in full")
-        if not errand.place:
-            return errand.unit, *answer.part
-        return self.joined(errand, answer)
+        if not task.place:
+            return task.unit, *answer.part
+        return self.joined(task, answer)
 
-    def failed(self, errand: _Errand, error: Exception) -> None:
+    def failed(self, task: _Task, error: Exception) -> None:
         """Halve a unit that needs too much memory; raise for everything else."""
         from distributed.scheduler import KilledWorker
 
@@ -529,13 +531,13 @@ class _Rendering:
             raise ClusterError(f"a worker lacks a package: {error}") from error
         if not isinstance(error, KilledWorker | MemoryError):
             raise error
-        self.deaths[errand] += 1
+        self.deaths[task] += 1
         if isinstance(error, KilledWorker) and not self.lacked_memory(error):
-            if self.deaths[errand] <= TRIALS:  # as workers may be killed for any reason
-                self.submit(errand)
+            if self.deaths[task] <= TRIALS:  # workers may be killed for any reason
+                self.submit(task)
                 return
-        unit = errand.unit
-        halves = unit.halves() if len(errand.place) < HALVINGS else None
+        unit = task.unit
+        halves = unit.halves() if len(task.place) < HALVINGS else None
         if halves is None:
             raise ClusterError(
                 f"workers die of no more than {unit.spp * unit.tile.pixels} samples, most likely "
@@ -548,22 +550,22 @@ class _Rendering:
         )
         self.halves.setdefault(unit.index, {})
         for number, half in enumerate(halves):
-            self.submit(_Errand(half, (*errand.place, number)))
+            self.submit(_Task(half, (*task.place, number)))
 
     def lacked_memory(self, error: KilledWorker) -> bool:
-        """Whether the worker that has died last was ended for its use of memory."""
+        """Whether the worker that died last was ended because it used too much memory."""
         with _connected():
             events = self.client.get_events("worker-restart-memory")
         return any(event.get("worker") == error.last_worker.address for _, event in events)
 
-    def joined(self, errand: _Errand, answer: Answer) -> tuple[Unit, Tile, np.ndarray] | None:
-        """Add a half to its unit; the unit, if it is whole then.
+    def joined(self, task: _Task, answer: Answer) -> tuple[Unit, Tile, np.ndarray] | None:
+        """Add a half to its unit. Returns the unit if it is complete.
 
-        Halves are added in their own order, whichever came first.
+        Halves are summed in a fixed order, whichever arrives first.
         """
-        found = self.halves[errand.unit.index]
-        found[errand.place] = answer.part
-        place = errand.place
+        found = self.halves[task.unit.index]
+        found[task.place] = answer.part
+        place = task.place
         while place:
             first, second = (found.get((*place[:-1], number)) for number in range(2))
             if first is None or second is None:
@@ -572,15 +574,15 @@ class _Rendering:
                 del found[(*place[:-1], number)]
             place = place[:-1]
             found[place] = _sum([first, second])
-        tile, sums = self.halves.pop(errand.unit.index)[()]
-        return errand.unit, tile, sums
+        tile, sums = self.halves.pop(task.unit.index)[()]
+        return task.unit, tile, sums
 
     def send(self, answer: Answer) -> None:
         """Send a worker the files that it lacks.
 
         Raises:
             ClusterError: they do not arrive.
-            OSError, ValueError: a file is gone, or has been changed.
+            OSError, ValueError: a file is gone, or has changed.
         """
         for content in answer.missing:
             if content not in self.job.package.contents:
@@ -591,7 +593,7 @@ class _Rendering:
                 try:
                     self.client.run(receive, content, offset, piece, last, workers=[answer.worker])
                 except Exception as failure:
-                    # A worker that has died meanwhile is not there to receive it, or to miss it.
+                    # If the worker has died, it neither receives the file nor needs it.
                     error = failure
                     break
             if error is not None and self.sent[answer.worker, content] > 3:
@@ -600,14 +602,15 @@ class _Rendering:
                 ) from error
 
     def tell_once(self, message: str) -> None:
-        if message not in self.told:
-            self.told.add(message)
+        """Tell the user a message, but only the first time."""
+        if message not in self.messages:
+            self.messages.add(message)
             self.cluster._tell(message)
 
 
 @contextlib.contextmanager
 def _connected() -> Iterator[None]:
-    """Raise ClusterError if the connection to the scheduler is lost in the block."""
+    """A context that raises :class:`ClusterError` if the connection to the scheduler is lost."""
     from distributed import CancelledError
     from distributed.comm import CommClosedError
 
@@ -618,7 +621,7 @@ def _connected() -> Iterator[None]:
 
 
 def _sum(parts: list[tuple[Tile, np.ndarray]]) -> tuple[Tile, np.ndarray]:
-    """Sums of two tiles, over the smallest rectangle that holds both."""
+    """The sum of two tiles, over the smallest rectangle that contains both."""
     (first, a), (second, b) = parts
     x, y = min(first.x, second.x), min(first.y, second.y)
     right = max(tile.x + tile.width for tile in (first, second))
@@ -636,14 +639,14 @@ def _is_loopback(address: str) -> bool:
 
 
 def core_count() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def visible_gpus() -> list[str]:
-    """NVIDIA GPUs that this process may use, by the names of ``CUDA_VISIBLE_DEVICES``."""
+    """Names, for ``CUDA_VISIBLE_DEVICES``, of the NVIDIA GPUs that this process may use."""
     import ctypes
 
     try:

@@ -1,4 +1,4 @@
-"""Denoising of indirect light alone: glints, which are direct light, are never smoothed away.
+"""Denoising of indirect light only: glints are direct light, and are never smoothed away.
 
 The integrator :mod:`glint_path <glintbsdf.plugins.glint_path>` separates the two. Indirect light is
 smooth but noisy (Tan et al. 2022, section 4), and Intel Open Image Denoise, through the package
@@ -22,12 +22,12 @@ NAME, ALBEDO, NORMAL = "glints", "albedo", "normal"
 
 @contextmanager
 def guided(integrator: mi.Integrator) -> Iterator[mi.Integrator]:
-    """Yield an integrator that renders as ``integrator`` does, but keeps direct and indirect light
-    apart and renders the guides along with them.
+    """Yield an integrator that renders the same image as ``integrator``, with direct and indirect
+    light in separate channels, and the guides in further ones.
 
     Raises:
         ValueError: ``integrator`` is not a ``glint_path``.
-        ModuleNotFoundError: there is no denoiser; the message has the command that helps.
+        ModuleNotFoundError: no denoiser is installed; the message has the command to install one.
     """
     if not hasattr(integrator, "separate"):
         raise ValueError(
@@ -48,7 +48,7 @@ def guided(integrator: mi.Integrator) -> Iterator[mi.Integrator]:
 
 
 def denoised(bitmap: mi.Bitmap) -> mi.Bitmap:
-    """The image that the integrator of :func:`guided` has rendered, its indirect light denoised.
+    """Denoise the indirect light of an image from the integrator of :func:`guided`.
 
     Red, green and blue are the direct light, unchanged, plus the denoised indirect light. There is
     an alpha channel if ``bitmap`` has one.
@@ -66,13 +66,13 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.
     """Filter an image.
 
     Args:
-        radiance: (H, W, 3) float32, linear, of any range; what is negative counts as zero.
+        radiance: (H, W, 3) float32, linear, of any range; negative values count as 0.
         albedo: (H, W, 3) float32 in [0, 1].
         normal: (H, W, 3) float32, shading normals in [-1, 1].
 
     Returns:
-        (H, W, 3) float32. The mean is kept within the few per cent that outliers make.
+        (H, W, 3) float32. Its mean may differ by a few per cent, as outliers are removed.
     """
-    import mitsuba_oidn  # costs a fraction of a second, and is not always installed
+    import mitsuba_oidn  # here: the import takes time, and the package may not be installed
 
     return np.asarray(mitsuba_oidn.denoise(radiance, albedo=albedo, normal=normal, hdr=True))

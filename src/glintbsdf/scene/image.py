@@ -1,7 +1,7 @@
-"""The image so far: the sums of the first units of a plan, and the noise that they still have.
+"""An unfinished image: the sums of the first units of a plan, and an estimate of their noise.
 
-Units of even and of odd passes are added up apart, as two images of half the samples: what these
-differ by tells the noise of the whole.
+Units of even passes and units of odd passes are summed separately. The difference of these two
+images, which have half of the samples each, gives the noise of the whole.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.units import Plan
 
-#: From so many passes on, the noise of an image is known.
+#: Smallest number of passes for an estimate of the noise.
 FEWEST_PASSES = 4
 
 
@@ -20,10 +20,10 @@ class Image:
 
     Attributes:
         plan (Plan): the units that make the image.
-        count (int): how many units are in the sums.
+        count (int): number of units in the sums.
         sums (numpy.ndarray | None): (height, width, channels) float64; None before the first unit.
-        odd (numpy.ndarray | None): the part of odd passes, in the channels up to the weight; None
-            before the first unit.
+        odd (numpy.ndarray | None): sums of odd passes alone, for the channels up to the weight;
+            None before the first unit.
     """
 
     def __init__(self, plan: Plan, base_channels: int) -> None:
@@ -33,11 +33,11 @@ class Image:
         self.odd: np.ndarray | None = None
 
     def add(self, tile: Tile, sums: np.ndarray) -> None:
-        """Add the unit that is next in the plan.
+        """Add the next unit of the plan.
 
         Args:
-            tile: pixels that its samples reach.
-            sums: sums of these pixels, (height, width, channels).
+            tile: pixels that samples of the unit reach.
+            sums: sums of samples in these pixels, (height, width, channels).
         """
         film = self.plan.film
         if self.sums is None or self.odd is None:
@@ -51,24 +51,24 @@ class Image:
 
     @property
     def fraction(self) -> float:
-        """How much of the image is in, in [0, 1]."""
+        """The fraction of units in the sums, in [0, 1]."""
         return self.count / len(self.plan)
 
     @property
     def passes(self) -> int:
-        """Passes that are in for every pixel."""
+        """Number of passes that are complete."""
         return self.count // len(self.plan.tiles)
 
     @property
     def spp(self) -> int:
-        """Samples that every pixel has."""
+        """Number of samples that every pixel has."""
         return self.plan.spp * self.passes // self.plan.parts
 
     @property
     def noise(self) -> float | None:
         """Standard error of a pixel's colours, root mean square over the image, over their mean.
 
-        None where fewer than :data:`FEWEST_PASSES` passes tell it, or the image is black.
+        None for fewer than :data:`FEWEST_PASSES` passes, and for a black image.
         """
         if self.sums is None or self.odd is None or self.passes < FEWEST_PASSES:
             return None

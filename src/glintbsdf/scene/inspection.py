@@ -1,11 +1,12 @@
-"""What a scene asks of its glint BSDFs, what they build for it, and building no more than that.
+"""Inspection and trimming: the queries that a scene makes to its glint BSDFs, and structures that
+are built for these queries only.
 
-A survey renders the scene with few samples and notes the part of each map and the footprints that
-its BSDF is asked for, along whole paths, by the scene's own sensor and integrator. The BSDFs are
-then built for these, and a margin (``domain.py``). Within them a trimmed BSDF answers as a complete
-one, to the last bit. Every pass of the rendering checks that nothing else has been asked for. If
-something has, all is built in full, and the pass is rendered again: the image is the same in any
-case.
+A survey renders the scene with few samples, along whole paths, with the scene's own sensor and
+integrator. It records the part of each map, and the sizes of footprints, in the queries of each
+BSDF. The BSDFs are then built for this domain and a margin (:mod:`~glintbsdf.footprint.domain`).
+Within the domain, a trimmed BSDF has the same values as a complete one, to the last bit. Every pass
+of the rendering checks that no query was outside. If one was, everything is built in full, and the
+pass is rendered again. So the image is the same in any case.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from glintbsdf.footprint.domain import NOTHING, Domain, Gate, Recorder
 from glintbsdf.maps.normalmap import MapShape
 from glintbsdf.scene import passes, rendering
 
-#: Paths that a survey follows, about.
+#: Approximate number of paths that a survey follows.
 PATHS = 1 << 18
 
 SEED = 0x5EED
 
-#: Memory that a report mentions, bytes.
+#: Smallest amount of memory that a report mentions, bytes.
 NOTABLE = 1e5
 
 
@@ -43,18 +44,22 @@ class Inspected:
 
 
 def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> Inspected:
-    """Load a scene from XML, its glint BSDFs not yet built."""
+    """Load a scene from XML without building its glint BSDFs."""
     return Inspected.of(rendering.load_scene(filename, parameters, deferred=True))
 
 
 def survey(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Domain | None]:
-    """What each BSDF is asked for where the scene is rendered with ``spp`` samples per pixel, by
-    the sensor ``which``, see :func:`~.chosen_sensor`.
+    """The domain of each BSDF's queries when the scene is rendered.
 
-    It is None for a BSDF that no path meets, or that has no map. BSDFs that are not built reflect
-    as smooth surfaces meanwhile: the paths' later bounces go where those of the rendering may go,
-    if not as often. Mitsuba's ``path`` asks a BSDF where a path ends as well, for nothing: that
-    counts.
+    The domain is None for a BSDF that no path hits, or that has no map. BSDFs that are not built
+    reflect like smooth surfaces during the survey. Their paths can go everywhere that paths of the
+    rendering go, but not as often. Mitsuba's ``path`` also evaluates a BSDF at the end of a path,
+    without using the value; these queries count as well.
+
+    Args:
+        inspected: the scene.
+        spp: samples per pixel of the rendering; None for the scene's own number.
+        which: the sensor, see :func:`~.chosen_sensor`.
 
     Raises:
         ValueError: see :func:`~.render`.
@@ -94,7 +99,7 @@ def build(inspected: Inspected) -> None:
 def build_trimmed(inspected: Inspected, domains: list[Domain | None]) -> None:
     """Build all BSDFs for their domains and a margin.
 
-    A BSDF with a map and no domain is not built at all; one without a map is built in full.
+    A BSDF with a map but without a domain is not built. A BSDF without a map is built in full.
 
     Args:
         inspected: what :func:`load` returns; nothing is built yet.
@@ -110,18 +115,18 @@ def build_trimmed(inspected: Inspected, domains: list[Domain | None]) -> None:
 
 
 class Trimmed:
-    """Glint BSDFs that hold no more than the scene asks for, until that turns out to be too little.
+    """Glint BSDFs that are built for the queries of a scene, and in full once a query is outside.
 
-    Its :meth:`missed` is for :class:`~glintbsdf.scene.rendering.Renderer`: what trimmed BSDFs have
-    answered within their domain stays, as it is the same to the last bit.
+    Its :meth:`missed` is an argument of :class:`~glintbsdf.scene.rendering.Renderer`. Units that
+    were rendered before stay valid, as all their queries were within the domain.
 
     Args:
         inspected: what :func:`load` returns.
-        spp: samples per pixel of the rendering, None for the scene's.
+        spp: samples per pixel of the rendering; None for the scene's own number.
         which: the sensor, see :func:`~.chosen_sensor`.
 
     Attributes:
-        sufficed (bool): whether nothing else has been asked for so far.
+        sufficed (bool): whether all queries so far were within the domain.
     """
 
     def __init__(self, inspected: Inspected, spp: int | None = None, which: str = "") -> None:
@@ -130,7 +135,8 @@ class Trimmed:
         build_trimmed(inspected, survey(inspected, spp, which))
 
     def missed(self) -> bool:
-        """Whether anything else has been asked for since the last call; then all is built now."""
+        """Whether a query since the last call was outside of the domain. If so, everything is built
+        in full."""
         if not self.sufficed or not any(
             bsdf.watch is not None and bsdf.watch.missed() for bsdf in self.inspected.bsdfs
         ):
@@ -147,16 +153,16 @@ class Trimmed:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of one glint BSDF of a scene.
+    """The report about one glint BSDF of a scene.
 
     Attributes:
         plugin, name (str): its type and its id.
-        shape (MapShape): shape of its map; None where there is no map.
-        domain (Domain): what it is asked for; None for nothing, or where there is no map.
-        complete, trimmed (dict[str, int]): memory of each part, bytes. Both are the same where
-            nothing can be trimmed.
-        left_out (list[str]): what its parameters leave out of what is built and evaluated.
-        notes (list[str]): what has been decided about the numbers of its map.
+        shape (MapShape): shape of its map; None without a map.
+        domain (Domain): domain of its queries; None if there are none, or without a map.
+        complete, trimmed (dict[str, int]): memory of each part when it is built in full, and when
+            it is trimmed, bytes. Both are equal if nothing can be trimmed.
+        left_out (list[str]): features that its parameters switch off, in words.
+        notes (list[str]): decisions about how to read its map, in words.
     """
 
     plugin: str
@@ -170,7 +176,7 @@ class Finding:
 
     def __str__(self) -> str:
         lines = [f'{self.plugin} "{self.name}"' if self.name else self.plugin]
-        lines += self.lines("map", self.asked())
+        lines += self.lines("map", self.map_and_queries())
         lines += self.lines("read", self.notes)
         lines += self.lines("built", amounts(self.complete))
         saved = sum(self.complete.values()) - sum(self.trimmed.values())
@@ -183,12 +189,12 @@ class Finding:
 
     @staticmethod
     def lines(title: str, entries: list[str]) -> list[str]:
-        """Entries under each other, beside their title."""
+        """Lines of a table: one per entry, the title in front of the first."""
         titles = [title] + [""] * len(entries)
         return [f"  {t:10}{entry}" for t, entry in zip(titles, entries, strict=False)]
 
-    def asked(self) -> list[str]:
-        """Lines about what of the map is asked for."""
+    def map_and_queries(self) -> list[str]:
+        """Lines about the map, and about the part of it that queries use."""
         if self.shape is None:
             return ["none"]
         width, height = self.shape.width, self.shape.height
@@ -214,7 +220,7 @@ class Finding:
 
 
 def amounts(parts: dict[str, int]) -> list[str]:
-    """Memory by parts, and their sum."""
+    """Lines with the memory of each part, and their sum."""
     notable = {name: size for name, size in parts.items() if size >= NOTABLE}
     if not notable:
         return ["next to nothing"]
@@ -224,18 +230,19 @@ def amounts(parts: dict[str, int]) -> list[str]:
 
 
 def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Finding]:
-    """What each BSDF is asked for and builds, and what of that ``render --trim`` would build.
+    """Report the queries of each BSDF, its memory, and its memory with ``render --trim``.
 
     Args:
         inspected: what :func:`load` returns.
-        spp: samples per pixel of the rendering, None for the scene's: footprints depend on it.
+        spp: samples per pixel of the rendering, on which footprints depend; None for the scene's
+            own number.
         which: the sensor, see :func:`~.chosen_sensor`.
     """
     domains = survey(inspected, spp, which)
     build_trimmed(inspected, domains)
     trimmed = [bsdf.parts() for bsdf in inspected.bsdfs]
     build(inspected)
-    domains = survey(inspected, spp, which)  # once more, by the glints themselves
+    domains = survey(inspected, spp, which)  # once more, with the complete BSDFs
     return [
         Finding(
             bsdf.owner,

@@ -1,7 +1,7 @@
-"""Merging: the sums of units become one image, the same whatever the order in which units arrive.
+"""Merging: the sums of units become one image, whatever the order in which units arrive.
 
-Sums of double precision are added in the order of the plan. A unit that arrives early waits for
-the units before it, on disk where many wait.
+Sums are added in double precision and in the order of the plan. So the image is the same to the
+last bit. A unit that arrives early waits for the units before it; if many wait, they do so on disk.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.storage import Checkpoint, Damaged, UnitFiles
 from glintbsdf.scene.units import Unit
 
-#: Yields units as they are done; None says that time has passed and nothing else.
+#: Yields units when they are done. None means that time has passed without a new one.
 Results = Generator["tuple[Unit, Tile, np.ndarray] | None", None, None]
 
-#: Units that wait for others take at most so many bytes of memory; the rest waits on disk.
+#: Bytes of memory for units that wait for others; more units wait on disk.
 WAITING = 256 << 20
 
 
@@ -33,16 +33,16 @@ def merge(
     time_limit: float | None = None,
     observe: Callable[[Image], None] = lambda image: None,
 ) -> None:
-    """Render the units of a plan and add them to ``image``, which holds what is in at any time.
+    """Render the units of a plan and add them to ``image``, which always has the sum so far.
 
     Args:
         image: an empty image.
-        render: yields the units that it gets, in any order, with their tiles and sums.
-        checkpoint: keeps what is done, and gives what it has.
-        until_noise: the work ends after a pass whose :attr:`Image.noise` is no more than that. The
-            image does not depend on the units that are under way then.
-        time_limit: the work ends after so many seconds.
-        observe: called whenever something has been added.
+        render: function of units that yields them in any order, with their tiles and sums.
+        checkpoint: keeps the units that are done. If it has some already, they are not rendered.
+        until_noise: stop after the first pass whose :attr:`Image.noise` is at most this. Units that
+            are being rendered at this moment do not count.
+        time_limit: stop after this many seconds.
+        observe: function that is called after every addition.
     """
     plan = image.plan
     begun = time.monotonic()
@@ -58,7 +58,7 @@ def merge(
             return noise is not None and noise <= until_noise
 
         def advance() -> bool:
-            """Add what is there and comes next; return whether that is enough."""
+            """Add all units that come next and are done. Returns whether to stop."""
             added = False
             while image.count < len(plan) and not satisfied():
                 found = waiting.take(image.count)
@@ -94,7 +94,8 @@ def merge(
 
 
 class _Waiting:
-    """Units that are done and not yet in the image: in the checkpoint and in memory."""
+    """Units that are done but not yet in the image; they are in memory, in the checkpoint or in a
+    temporary folder."""
 
     def __init__(self, spare: UnitFiles, checkpoint: Checkpoint | None) -> None:
         self.files = spare if checkpoint is None else checkpoint.units
@@ -109,7 +110,7 @@ class _Waiting:
             self.memory[index] = tile, sums
 
     def holds(self, index: int) -> bool:
-        """Whether a unit is there; one that is damaged is not."""
+        """Whether a unit is done. A damaged file does not count, and is removed."""
         if index in self.memory:
             return True
         try:
@@ -119,7 +120,7 @@ class _Waiting:
             return False
 
     def take(self, index: int) -> tuple[Tile, np.ndarray] | None:
-        """A unit that is there, or None. In a checkpoint it stays."""
+        """A unit that is done, or None. It is removed here, but not from a checkpoint."""
         found = self.memory.pop(index, None)
         if found is None:
             try:

@@ -1,9 +1,9 @@
-"""A scene as it travels: its XML, the files that it names, and what they must be.
+"""A scene that is sent to other machines: its XML, the files that it names, and their digests.
 
-A :class:`Package` says what a scene consists of, by digests of content. Whoever is to load it looks
-for the files where their names say, which serves on one machine and on a shared file system. A file
-that is not there, or is another, is sent; the receiver keeps it in a folder under its digest. No
-name that a package holds can lead out of that folder.
+A :class:`Package` lists everything that a scene consists of, by digests of content. A receiver
+first looks for each file at its original path, which works on one machine and on a shared file
+system. A file that is missing or different there is sent. The receiver keeps it in a folder, under
+its digest. No name in a package can lead out of this folder.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from glintbsdf.scene import rendering
 _DIGEST = re.compile(r"[0-9a-f]{40}")
 _SUFFIX = re.compile(r"(\.[A-Za-z0-9_]{1,16})?")
 
-#: Bytes of a file that are sent at a time.
+#: Size of the pieces in which a file is sent, bytes.
 PIECE = 8 << 20
 
 
 class BadPackage(ValueError):
-    """A package, or a piece of a file, is not what a sender of good will sends."""
+    """A package, or a piece of a file, is not valid; no correct sender sends it."""
 
 
 # ------------------------------------------------------------------------------------------------
@@ -43,12 +43,12 @@ class BadPackage(ValueError):
 
 @dataclass(frozen=True)
 class Content:
-    """A file by its content.
+    """A file, identified by its content.
 
     Attributes:
         digest (str): digest of its bytes, 40 hexadecimal digits.
-        suffix (str): suffix of its name, such as ``.exr``: some readers go by it.
-        path (str): where its owner has it.
+        suffix (str): suffix of its name, such as ``.exr``; some readers depend on it.
+        path (str): path of the original file.
     """
 
     digest: str
@@ -57,15 +57,16 @@ class Content:
 
     @staticmethod
     def of(path: Path) -> Content:
+        """The content of a file."""
         suffix = path.suffix if _SUFFIX.fullmatch(path.suffix) else ""
         return Content(digest_of(path), suffix, str(path.absolute()))
 
     @property
     def name(self) -> str:
-        """The name under which a receiver keeps it.
+        """The name under which a receiver keeps the file.
 
         Raises:
-            BadPackage: the name would lead elsewhere.
+            BadPackage: digest or suffix is not valid, so that the name might lead elsewhere.
         """
         if not _DIGEST.fullmatch(self.digest) or not _SUFFIX.fullmatch(self.suffix):
             raise BadPackage(
@@ -85,7 +86,7 @@ def digest_of(path: Path) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _digest_of_status(path: Path, _modified: int, _size: int) -> str:
-    """The digest of a file, read again where the file has changed."""
+    """The digest of a file, computed again if its time or size has changed."""
     return digest_of(path)
 
 
@@ -93,14 +94,14 @@ class Store:
     """A folder of files under their digests.
 
     Args:
-        folder: the folder; it is made when the first file arrives.
+        folder: the folder; it is created when the first file arrives.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def find(self, content: Content) -> Path | None:
-        """A file of that content, the owner's or one that was received; None if there is none."""
+        """A file with this content, either received or the original one; None if there is none."""
         received = self.folder / content.name
         if received.is_file():
             return received
@@ -116,10 +117,10 @@ class Store:
         return own
 
     def receive(self, content: Content, offset: int, piece: bytes, last: bool) -> None:
-        """Take the next piece of a file; with the last one the file is there.
+        """Receive the next piece of a file. After the last one the file exists.
 
         Raises:
-            BadPackage: pieces are out of order, or make another file than was promised.
+            BadPackage: pieces are out of order, or the file does not have its digest.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         unfinished = self.folder / f"{content.name}.{os.getpid()}.part"
@@ -137,11 +138,11 @@ class Store:
 
 
 def pieces(content: Content) -> Iterator[tuple[int, bytes, bool]]:
-    """What :meth:`Store.receive` takes, of the owner's file.
+    """The pieces of an original file: the arguments of :meth:`Store.receive`.
 
     Raises:
         OSError: the file is gone.
-        ValueError: the file has changed meanwhile.
+        ValueError: the file has changed.
     """
     path = Path(content.path)
     if digest_of(path) != content.digest:
@@ -163,12 +164,12 @@ def pieces(content: Content) -> Iterator[tuple[int, bytes, bool]]:
 
 @dataclass(frozen=True)
 class Package:
-    """What a scene consists of.
+    """Everything that a scene consists of.
 
     Attributes:
-        documents (tuple[tuple[str, Content], ...]): XML files, the scene's own first, by names
-            relative to a common folder.
-        files (tuple[tuple[str, Content], ...]): all other files, by the names in the XML.
+        documents (tuple[tuple[str, Content], ...]): XML files by name, relative to a common folder;
+            the scene's own file comes first.
+        files (tuple[tuple[str, Content], ...]): all other files, by their names in the XML.
         definitions (tuple[tuple[str, str], ...]): values of the scene's parameters.
     """
 
@@ -199,7 +200,7 @@ class Package:
 
     @property
     def digest(self) -> str:
-        """A digest of all that decides the scene, whatever place its owner keeps the files in."""
+        """A digest of everything that determines the scene. Paths of files do not count."""
         parts = [
             [[name, content.digest] for name, content in group]
             for group in (self.documents, self.files)
@@ -208,11 +209,11 @@ class Package:
         return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
 
     def missing(self, store: Store) -> list[Content]:
-        """Files that must be sent."""
+        """Files that must be sent, as ``store`` does not find them."""
         return [content for content in self.contents if store.find(content) is None]
 
     def load(self, store: Store, deferred: bool = False) -> mi.Scene:
-        """Load the scene, of which nothing is missing; see :func:`.load_scene`.
+        """Load the scene, see :func:`.load_scene`. No file may be missing.
 
         Raises:
             BadPackage: a name leads out of the folder.
@@ -233,7 +234,7 @@ class Package:
 def inputs(
     filename: str | Path, definitions: Mapping[str, str] | None = None
 ) -> tuple[list[Path], dict[str, Path]]:
-    """The XML files of a scene, its own first, and all other files by the names in the XML.
+    """The XML files of a scene, its own first, and all other files, by their names in the XML.
 
     Raises:
         RuntimeError: the XML cannot be read.
@@ -249,10 +250,10 @@ def inputs(
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The place of a relative name in a folder.
+    """The path of a relative name in a folder.
 
     Raises:
-        BadPackage: the place is not in the folder.
+        BadPackage: the path leads out of the folder.
     """
     pure = PurePosixPath(name)
     bad = pure.is_absolute() or ".." in pure.parts or not pure.parts or "\\" in name or ":" in name
@@ -282,8 +283,8 @@ def _find(value: str, folder: Path) -> Path | None:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """What must be the same on all machines, so that their images are: the versions of packages,
-    and the source of this one."""
+    """Everything that must be the same on all machines for equal images: the versions of packages,
+    and a digest of this package's source."""
     digest = hashlib.blake2b(digest_size=6)
     for package in ("glintbsdf", "glintbsdf.plugins"):
         folder = Path(next(iter(importlib.import_module(package).__path__)))
@@ -298,7 +299,7 @@ def versions() -> dict[str, str]:
 
 
 def version_difference(others: Mapping[str, str]) -> str | None:
-    """In words, what the versions here and elsewhere differ in; None where they do not."""
+    """The first difference of the versions here and elsewhere, in words; None if there is none."""
     for name, own in versions().items():
         if others.get(name) != own:
             return f"{name} {own}, and not {others.get(name)}"
@@ -307,7 +308,7 @@ def version_difference(others: Mapping[str, str]) -> str | None:
 
 @dataclass(frozen=True)
 class Job:
-    """An image to be made: all that decides it.
+    """An image to render: everything that determines it.
 
     Attributes:
         package (Package): the scene.
@@ -316,7 +317,7 @@ class Job:
         seed (int): seed of the image.
         denoise, trim (bool): see :class:`~glintbsdf.scene.rendering.Renderer` and
             :class:`~glintbsdf.scene.inspection.Trimmed`.
-        sensor (str): which, see :func:`~glintbsdf.scene.rendering.chosen_sensor`.
+        sensor (str): the sensor, see :func:`~glintbsdf.scene.rendering.chosen_sensor`.
     """
 
     package: Package
@@ -328,6 +329,6 @@ class Job:
     sensor: str = ""
 
     def description(self) -> dict[str, object]:
-        """For checkpoints: what decides the image, in words and numbers."""
+        """Everything that determines the image, for checkpoints, as values for JSON."""
         own = {k: v for k, v in asdict(self).items() if k not in ("package", "trim")}
         return {"scene": self.package.digest, **own, **versions()}

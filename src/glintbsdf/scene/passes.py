@@ -1,14 +1,12 @@
-"""One pass over the pixels of a film: its samples, and their sums in an order that is always the
-same.
+"""One pass over the pixels of a film: samples, and their sums in a fixed order.
 
-Mitsuba adds samples to its film by atomic operations of single precision. Their order, and with it
-the last bits of an image, changes from run to run as threads take turns. Here every pixel adds up
-the samples within reach of the reconstruction filter itself, one after the other and in double
-precision. A pass is then the same to the last bit for any number of threads, in any process.
+Mitsuba adds samples to its film by atomic operations in single precision. Their order depends on
+the threads, and with it the last bits of an image. Here every pixel adds the samples within reach
+of its reconstruction filter itself, one after the other and in double precision. So a pass is the
+same to the last bit for any number of threads and in any process.
 
-A pass knows how many samples the whole image has: as in Mitsuba, ``sampler.sample_count()`` and
-the scale 1/√spp of ray differentials belong to all passes together. What footprints carry does
-not depend on how an image is divided into passes.
+As in Mitsuba, ``sampler.sample_count()`` and the scale 1/√spp of ray differentials refer to the
+samples of the whole image. So footprints do not depend on the number of passes.
 """
 
 from __future__ import annotations
@@ -24,7 +22,8 @@ from glintbsdf.bridge.filter_sampling import SharedFilter, colours
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of pixels, counted from the upper left corner of the uncropped film."""
+    """A rectangle of pixels. Its position is relative to the upper left corner of the whole film,
+    without the crop."""
 
     x: int
     y: int
@@ -36,12 +35,12 @@ class Tile:
         return self.width * self.height
 
     def slices(self, within: Tile) -> tuple[slice, slice]:
-        """Rows and columns of this tile in an array of the pixels of ``within``."""
+        """Rows and columns of this tile in an array over the pixels of ``within``."""
         top, left = self.y - within.y, self.x - within.x
         return slice(top, top + self.height), slice(left, left + self.width)
 
     def widened(self, border: int, within: Tile) -> Tile:
-        """With ``border`` pixels more on every side that lie in ``within``."""
+        """The tile with ``border`` more pixels on every side, as far as they lie in ``within``."""
         left, top = max(self.x - border, within.x), max(self.y - border, within.y)
         right = min(self.x + self.width + border, within.x + within.width)
         bottom = min(self.y + self.height + border, within.y + within.height)
@@ -49,14 +48,14 @@ class Tile:
 
 
 def whole(film: mi.Film) -> Tile:
-    """All pixels of a film that an image shows: its crop window."""
+    """The crop window of a film: all pixels of its image."""
     x, y = (int(v) for v in film.crop_offset())
     width, height = (int(v) for v in film.crop_size())
     return Tile(x, y, width, height)
 
 
 def reach(film: mi.Film) -> int:
-    """Pixels beyond its own that a sample adds to, on each side."""
+    """Number of neighbouring pixels, on each side, that a sample contributes to."""
     rfilter = film.rfilter()
     return 0 if rfilter.is_box_filter() else int(rfilter.border_size())
 
@@ -76,14 +75,14 @@ def sums_of_samples(
     Args:
         tile: pixels that get samples.
         spp: samples per pixel of this pass.
-        total: samples per pixel of the image, by which footprints are scaled.
+        total: samples per pixel of the image; footprints are scaled by it.
         seed: seed of the sensor's sampler.
-        shared: places samples by the film's filter, which then does not spread them.
+        shared: places samples by the film's filter. A sample then counts in its own pixel only.
 
     Returns:
-        The tile widened by the reach of the film's filter, within its crop window, and its sums:
-        (height, width, channels) float32. The channels are as the film stores them: colours times
-        weight, then alpha if there is any, the weight, and the integrator's further channels.
+        The tile, widened by the reach of the film's filter within the crop window, and its sums:
+        (height, width, channels) float32. The channels are those of the film: colours times
+        weight, alpha if the film has it, the weight, and the integrator's AOVs.
     """
     film = sensor.film()
     film.prepare(integrator.aov_names())
@@ -92,7 +91,7 @@ def sums_of_samples(
     with dr.suspend_grad():
         sampler = sensor.sampler().clone()
         sampler.set_sample_count(total)
-        if total % spp == 0:  # what stratified samplers must know
+        if total % spp == 0:  # stratified samplers need this
             sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, tile.pixels * spp)
 
@@ -120,10 +119,10 @@ def _camera_rays(
     shared: SharedFilter | None,
     seed: int,
 ) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Point2f, mi.Float]:
-    """Rays through the pixels of a tile, their weights, where they cross the film (pixels), and the
-    signs with which they count.
+    """Rays through the pixels of a tile, their weights, their positions on the film (pixels), and
+    the signs of their contributions.
 
-    The samples of a pixel follow each other. Random numbers are drawn in Mitsuba's order.
+    The samples of a pixel are consecutive. Random numbers are drawn in Mitsuba's order.
     """
     film = sensor.film()
     number, per_pixel = dr.arange(mi.UInt32, tile.pixels * spp), dr.opaque(mi.UInt32, spp)
@@ -162,7 +161,7 @@ def _sample(
     sampler: mi.Sampler,
     ray: mi.RayDifferential3f,
 ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-    """Radiance along rays, whether they belong to a surface, and AOVs."""
+    """Radiance along rays, whether they hit a surface, and AOVs."""
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     if not isinstance(integrator, ADIntegrator):
@@ -188,7 +187,7 @@ def _channels(
     aovs: list[mi.Float],
     wavelengths: mi.Color0f,
 ) -> list[mi.Float]:
-    """What a film stores of samples of weight one."""
+    """The channels of samples of weight one, as the film stores them."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         unpolarized = mi.unpolarized_spectrum(radiance) if mi.is_polarized else radiance
         alpha = dr.select(valid, mi.Float(1), mi.Float(0))
@@ -209,16 +208,17 @@ def _sums(
     """Filtered sums of samples, (height, width, channels) float32, for the pixels of ``target``.
 
     Args:
-        channels: channels of all samples of ``tile``, evaluated; a pixel's samples follow each
-            other.
+        channels: channels of all samples of ``tile``, evaluated; samples of a pixel are
+            consecutive.
         offset: position of each sample in its pixel, in [0, 1]².
-        rfilter, border: the filter that spreads samples, over so many pixels on each side.
+        rfilter: the reconstruction filter.
+        border: its reach, in pixels on each side.
     """
     count = len(channels)
     width = dr.opaque(mi.UInt32, target.width)
     index = dr.arange(mi.UInt32, target.pixels)
     row = index // width
-    # The pixel in the middle of the filter, counted in the tile that has samples.
+    # The pixel in the middle of the filter, relative to the tile that has samples.
     x = mi.Int32(index - row * width) + dr.opaque(mi.Int32, target.x - tile.x)
     y = mi.Int32(row) + dr.opaque(mi.Int32, target.y - tile.y)
     columns, rows = dr.opaque(mi.Int32, tile.width), dr.opaque(mi.Int32, tile.height)
@@ -238,7 +238,7 @@ def _sums(
         inside = (column >= 0) & (column < columns) & (line >= 0) & (line < rows)
         source = mi.UInt32(line * columns + column) * per_pixel + sample
         if border:
-            # Distance of the sample from the centre of the pixel that collects it.
+            # The filter at the distance of the sample from the centre of the receiving pixel.
             kernel = mi.Float(1)
             for within, pixels in ((offset.x, dx), (offset.y, dy)):
                 at = dr.gather(mi.Float, within, source, inside)
@@ -250,7 +250,7 @@ def _sums(
             total + weight * mi.Float64(dr.gather(mi.Float, channel, source, inside))
             for total, channel in zip(sums, channels, strict=True)
         ]
-        done = (sample + 1 == per_pixel) | ~inside  # beyond the tile there is nothing to visit
+        done = (sample + 1 == per_pixel) | ~inside  # there are no samples outside of the tile
         return (
             dr.select(done, neighbour + 1, neighbour),
             dr.select(done, 0, sample + 1),
@@ -268,26 +268,26 @@ def _sums(
 def _sums_of_a_film(
     scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, spp: int, seed: int
 ) -> np.ndarray:
-    """Sums of all pixels from Mitsuba's own film, for integrators that do not follow the rays of
-    a sensor, as ``ptracer``: they spread samples over the image, and last bits vary."""
+    """Sums of all pixels from Mitsuba's own film, for integrators such as ``ptracer`` that do not
+    start from the rays of a sensor. The last bits of these sums vary."""
     film = sensor.film()
     sampler = sensor.sampler()
     own = sampler.sample_count()
     integrator.render(scene, sensor, seed=seed, spp=spp)
     sampler.set_sample_count(own)
-    if integrator.should_stop():  # Mitsuba caught Ctrl-C, and Python was not told
+    if integrator.should_stop():  # Mitsuba has caught Ctrl-C; Python does not know of it
         raise KeyboardInterrupt
     stored = np.array(film.bitmap(raw=True), dtype=np.float32)
     index = film.base_channels_count()
     weight = stored[..., index, None]
-    # What particles bring has no weight, and is an image already.
+    # Contributions of particles have no weight, and are an image already.
     image = np.where(weight > 0, stored / np.where(weight > 0, weight, 1), stored)
     image[..., index] = 1
     return image * np.float32(spp)
 
 
 def developed(film: mi.Film, aov_names: list[str], sums: np.ndarray) -> mi.Bitmap:
-    """The image of a film whose samples have the sums (height, width, channels)."""
+    """The developed image of a film, from the sums of its samples (height, width, channels)."""
     film.prepare(aov_names)
     film.put_block(
         mi.ImageBlock(mi.TensorXf(sums.astype(np.float32)), mi.ScalarPoint2i(film.crop_offset()))

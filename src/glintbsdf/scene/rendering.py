@@ -1,4 +1,5 @@
-"""Render a scene file to an image file: footprints from the sensor, units, whole files only."""
+"""Render a scene file to an image file: it sets footprints from the sensor, renders units, and
+writes complete files only."""
 
 from __future__ import annotations
 
@@ -39,22 +40,24 @@ def load_scene(
     deferred: bool = False,
     files: Mapping[str, str] | None = None,
 ) -> mi.Scene:
-    """Load a scene from XML. ``parameters`` takes the place of its ``$key`` and ``<default>``.
+    """Load a scene from XML.
 
-    ``files`` says where files are that the scene names otherwise.
+    Dr.Jit gets a second thread if it has only one, as Mitsuba hangs when it reads an OpenEXR file
+    with one thread.
 
-    With ``deferred``, its glint BSDFs build nothing yet: :func:`glint_bsdfs` finds them, and their
-    ``build`` is called for what the scene asks of them.
-
-    Dr.Jit gets a second thread where it has only one: Mitsuba would never return from reading an
-    OpenEXR file.
+    Args:
+        filename: the XML file.
+        parameters: values for the scene's ``$key``, in place of its ``<default>``.
+        deferred: whether glint BSDFs build nothing yet. :func:`glint_bsdfs` finds them, and their
+            ``build`` must be called for the queries that the scene needs.
+        files: paths of files, by the names that the scene has for them.
     """
     collect_former_scenes()
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
     parameters = dict(parameters or {})
     if not deferred and not files:
-        # The names of a scene's parameters are known to nobody beforehand.
+        # The stubs cannot know the names of a scene's parameters.
         return mi.load_file(str(filename), **parameters)  # type: ignore[arg-type]
     config = mi.parser.ParserConfig(mi.variant() or "")
     with folder_of_files(Path(filename).resolve().parent):
@@ -73,7 +76,7 @@ def load_scene(
 
 
 def strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str, str]]:
-    """All strings of a parsed scene: the node, the property's name, its value."""
+    """All string properties of a parsed scene: node, name and value."""
     for node in state.nodes:
         for key in list(node.props.keys()):
             value = node.props[key]
@@ -81,13 +84,13 @@ def strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode,
                 yield node, key, value
 
 
-#: Plugins that build their structures late where a scene is loaded for that.
+#: Plugins that do not build their structures in a scene that is loaded ``deferred``.
 DEFERRABLE = ("glint_diffuse", "glint_elements", "glint_filtered", "glint_manifold", "glint_mip")
 
 
 @contextmanager
 def folder_of_files(folder: Path) -> Iterator[None]:
-    """Look for a scene's files in ``folder`` first, as ``mi.load_file`` does."""
+    """A context in which files are searched in ``folder`` first, as ``mi.load_file`` does."""
     resolver = mi.file_resolver()  # type: ignore[operator]  # an object in the stubs
     before = [resolver[k] for k in range(len(resolver))]
     resolver.prepend(str(folder))
@@ -100,7 +103,7 @@ def folder_of_files(folder: Path) -> Iterator[None]:
 
 
 def glint_bsdfs(scene: mi.Scene) -> list:
-    """All BSDFs of this package in a scene, wherever they are nested, each once."""
+    """All BSDFs of this package in a scene, at any depth, each of them once."""
     from glintbsdf.bridge.bsdf import FootprintBSDF
 
     return [node for node in mi.traverse(scene).hierarchy if isinstance(node, FootprintBSDF)]
@@ -122,10 +125,10 @@ def pixel_angle(sensor: mi.Sensor) -> float:
 
 
 def chosen_sensor(scene: mi.Scene, which: str = "") -> mi.Sensor:
-    """The sensor that a scene is rendered with: by its number, from 0, or its id; the first one.
+    """A sensor of the scene, by its number (from 0) or its id; by default the first one.
 
     Raises:
-        ValueError: the scene has no sensor, or no such one.
+        ValueError: the scene has no sensor, or none of this number or id.
     """
     sensors = scene.sensors()
     if not sensors:
@@ -139,17 +142,17 @@ def chosen_sensor(scene: mi.Scene, which: str = "") -> mi.Sensor:
 
 
 def listed(sensors: list[mi.Sensor]) -> str:
-    """Sensors by number and id."""
+    """A list of sensors in words, by number and id."""
     return ", ".join(f'{number} "{sensor.id()}"' for number, sensor in enumerate(sensors))
 
 
 @contextmanager
 def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
-    """In the block, give the glint BSDFs of ``scene`` the footprint of ``spp`` samples per pixel.
+    """A context in which glint BSDFs have the footprint of an image with ``spp`` samples per pixel.
 
     A BSDF whose ``pixel_spread`` is 0 gets the sensor's pixel angle, scaled by 1/√spp as Mitsuba
-    scales ray differentials. ``spp`` counts the samples of the whole image; integrators are told
-    the same number, whatever passes the image is made in (:mod:`glintbsdf.scene.passes`).
+    scales ray differentials. ``spp`` is the number of samples of the whole image, whatever its
+    passes; integrators see the same number (:mod:`glintbsdf.scene.passes`).
     """
     parameters = mi.traverse(scene)
     parameters.keep([r".*pixel_spread$"])
@@ -168,10 +171,10 @@ def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
 
 @contextmanager
 def sharing(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[SharedFilter | None]:
-    """In the block, let the scene's ``glint_path`` give footprints their share of the pixel's
-    filter, for an image of ``spp`` samples per pixel in whatever passes.
+    """A context in which the scene's ``glint_path`` gives footprints their share of the pixel's
+    filter, for an image with ``spp`` samples per pixel, whatever its passes.
 
-    Yields how samples are to be placed then; None where the scene has another integrator.
+    Yields how to place samples; None if the scene has another integrator.
     """
     integrator = scene.integrator()
     if not hasattr(integrator, "sharing"):
@@ -187,21 +190,21 @@ def sharing(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[SharedFilt
 
 
 class Renderer:
-    """A loaded scene, ready to render units of an image; a context manager.
+    """Renders units of an image of a loaded scene; a context manager.
 
     Args:
-        scene: the scene, its BSDFs built or trimmed.
-        spp: samples per pixel of the whole image, None for what the scene says. Mitsuba rounds it
-            up where the sampler requires it.
-        denoise: the image will be denoised, see :mod:`glintbsdf.scene.denoising`.
-        missed: called after each unit; whether the unit has asked for something that was not there,
-            and is there now, so that the unit must be rendered again.
+        scene: the scene, whose BSDFs are built or trimmed.
+        spp: samples per pixel of the whole image; None for the scene's own number. Mitsuba rounds
+            it up if the sampler requires this.
+        denoise: whether the image will be denoised, see :mod:`glintbsdf.scene.denoising`.
+        missed: called after each unit. It returns whether the unit needed structures that were left
+            out. They must exist after the call, and the unit is rendered again.
         which: the sensor, see :func:`chosen_sensor`.
 
     Raises:
         ValueError: there is no sensor, or a mesh lacks the UVs that its BSDF needs, or ``denoise``
-            is asked of an integrator other than ``glint_path``.
-        ModuleNotFoundError: ``denoise`` is asked for, and no denoiser is installed.
+            is set for an integrator other than ``glint_path``.
+        ModuleNotFoundError: ``denoise`` is set, and no denoiser is installed.
     """
 
     def __init__(
@@ -234,7 +237,7 @@ class Renderer:
         self._stack.close()
 
     def plan(self, seed: int) -> Plan:
-        """How the image of a seed is divided."""
+        """The plan of the image with this seed."""
         divisible = isinstance(self.integrator, mi.SamplingIntegrator)
         film = passes.whole(self.sensor.film())
         return Plan(film, self.spp, seed, self.stratified, divisible)
@@ -264,18 +267,18 @@ class Renderer:
             yield unit, *self.render(unit)
 
     def developed(self, sums: np.ndarray) -> mi.Bitmap:
-        """The image of the sums (height, width, channels) of all its pixels."""
+        """The image from the sums (height, width, channels) of all its pixels."""
         bitmap = passes.developed(self.sensor.film(), self.integrator.aov_names(), sums)
         return denoised(bitmap) if self.denoise else bitmap
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image, or as much of it as is done.
+    """A finished or unfinished image.
 
     Attributes:
-        bitmap (mi.Bitmap): what is done.
-        fraction (float): the part of the samples that is in, in (0, 1].
+        bitmap (mi.Bitmap): the image so far.
+        fraction (float): fraction of the samples that it contains, in (0, 1].
         noise (float | None): see :attr:`.Image.noise`.
     """
 
@@ -285,7 +288,7 @@ class Picture:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, when a part of an image was done: ``picture``."""
+    """Ctrl-C came when a part of the image was done; ``picture`` is this part."""
 
     def __init__(self, picture: Picture) -> None:
         super().__init__()
@@ -301,16 +304,17 @@ def produce(
     time_limit: float | None = None,
     observe: Callable[[Image], None] = lambda image: None,
 ) -> Picture:
-    """Render the image of a seed.
+    """Render the image with a seed.
 
     Args:
-        renderer: plans and develops the image; it has been entered.
-        render_all: renders the units; None for ``renderer`` itself. See :func:`.merge` for this
-            and the rest.
+        renderer: plans and develops the image; its context must have been entered.
+        seed: seed of the image.
+        render_all: renders the units; by default ``renderer`` does. See :func:`.merge` for this
+            and the other arguments.
 
     Raises:
         Interrupted: Ctrl-C came when a part of the image was done.
-        KeyboardInterrupt: Ctrl-C came before.
+        KeyboardInterrupt: Ctrl-C came before any part was done.
     """
     image = Image(renderer.plan(seed), renderer.sensor.film().base_channels_count() + 1)
     try:
@@ -331,10 +335,10 @@ def produce(
 
 
 def picture(renderer: Renderer, image: Image) -> Picture:
-    """What is done of an image.
+    """The finished part of an image.
 
     Raises:
-        ValueError: nothing is done.
+        ValueError: no part is done.
     """
     if image.sums is None:
         raise ValueError("no unit of the image is done")
@@ -350,18 +354,20 @@ def render(
 ) -> mi.Bitmap:
     """Render the first sensor of ``scene`` and return its developed film.
 
-    The image is made in units, see :mod:`glintbsdf.scene.units`, and ``report`` is called with the
-    fraction done after each. It is the same to the last bit whenever it is rendered. BSDFs see the
-    pixels' footprints, see :func:`footprints`.
+    The image is rendered in units, see :mod:`glintbsdf.scene.units`. It is the same to the last bit
+    in every run. BSDFs see the footprints of pixels, see :func:`footprints`.
 
     Args:
-        spp: samples per pixel; None for what the scene says. Mitsuba rounds it up where the
-            sampler requires it.
-        denoise: filter indirect light, see :mod:`glintbsdf.scene.denoising`.
+        scene: the scene.
+        spp: samples per pixel; None for the scene's own number. Mitsuba rounds it up if the sampler
+            requires this.
+        seed: seed of the image.
+        report: called after each unit, with the fraction that is done.
+        denoise: whether to denoise indirect light, see :mod:`glintbsdf.scene.denoising`.
 
     Raises:
         ValueError, ModuleNotFoundError: see :class:`Renderer`.
-        Interrupted: Ctrl-C came; the exception has what is done.
+        Interrupted: Ctrl-C came; the exception has the finished part of the image.
     """
     with Renderer(scene, spp, denoise) as renderer:
         done = produce(renderer, seed, observe=lambda image: report(image.fraction))
@@ -374,7 +380,8 @@ def render(
 
 
 def save(bitmap: mi.Bitmap, path: str | Path) -> None:
-    """Write an image: ``.exr`` as it is, ``.png`` its colours alone, as 8-bit sRGB."""
+    """Write an image. An ``.exr`` file has all channels, a ``.png`` file the colours as 8-bit
+    sRGB."""
     if Path(path).suffix.lower() == ".png":
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = bitmap.split()[0][1]
@@ -384,12 +391,11 @@ def save(bitmap: mi.Bitmap, path: str | Path) -> None:
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary file beside ``path`` that takes its place when the block succeeds.
+    """Yield a temporary file beside ``path`` that replaces ``path`` if the block succeeds.
 
-    The file is made at once, so that a place that cannot be written shows before the work is done.
-    What has been written is brought to the disk and read back, as Mitsuba does not tell of a disk
-    that is full. Whatever ends the block otherwise, ``path`` stays as it was and nothing else is
-    left.
+    The file is created at once, so a folder that cannot be written is noticed before the work. What
+    was written is synchronised to the disk and read back, as Mitsuba does not report a full disk.
+    If the block fails, ``path`` stays as it was, and the temporary file is removed.
 
     Raises:
         OSError: the folder does not exist or cannot be written, or ``path`` is a folder; or the
@@ -414,7 +420,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         os.replace(temporary, path)
-    except RuntimeError as error:  # of a writer, which knows the temporary name only
+    except RuntimeError as error:  # a writer's message has the temporary name
         if str(temporary) in str(error):
             reason = str(error).rpartition(f'{temporary}"')[2].strip(": ")
             raise OSError(f"cannot write {path}: {reason}") from error
@@ -424,10 +430,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def _require_whole(written: Path, path: Path) -> None:
-    """Raise OSError unless a file has arrived on the disk as a whole.
+    """Raise OSError unless a file is complete on the disk.
 
     An image is read back: OpenEXR's reader finds missing and damaged parts, and so does Mitsuba's
-    reader of PNG. Any other file is only known not to be empty.
+    reader for PNG. Any other file is only checked not to be empty.
     """
     reason = "it is empty"
     try:
@@ -445,7 +451,7 @@ def _require_whole(written: Path, path: Path) -> None:
                 whole = True
             if whole:
                 return
-    except Exception as error:  # of a library, or of the system: the file is not whole
+    except Exception as error:  # whatever the library or the system raises, the file is not whole
         reason = " ".join(str(error).split())
     free = shutil.disk_usage(written.parent).free
     raise OSError(

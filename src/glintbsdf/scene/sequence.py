@@ -1,5 +1,4 @@
-"""Sequences: the values of each frame's parameters, the names of images, and a sheet or a video of
-all of them."""
+"""Sequences of frames: the parameters of each frame, names of images, contact sheets and videos."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from typing import IO, cast
 import mitsuba as mi
 import numpy as np
 
-#: Width and height of an image on a sheet, at most; pixels.
+#: Largest width and height of an image on a contact sheet, pixels.
 THUMBNAIL = 320
 
 _GAP = 4  # pixels between two images on a sheet
@@ -28,7 +27,7 @@ _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)")
 
 
 class SequenceError(ValueError):
-    """A sequence cannot be made of what was given; the message says why."""
+    """The arguments do not make a sequence; the message says why."""
 
 
 # ------------------------------------------------------------------------------------------------
@@ -37,7 +36,7 @@ class SequenceError(ValueError):
 
 
 def values_of(text: str) -> list[str] | None:
-    """The values of a range ``first:last:count``, both ends included; None for other texts.
+    """The values of a range ``first:last:count``, with both ends; None for any other text.
 
     Raises:
         SequenceError: the range is empty.
@@ -59,14 +58,15 @@ def frames_of(
     """The parameters of each frame.
 
     Args:
-        definitions: parameters of all frames; a value that is a range makes frames.
-        table: parameters of single frames, one mapping for each.
-        together: ranges go on together, frame by frame; else frames are made for all combinations,
-            of which the last range changes fastest. A table is one more range, the first.
+        definitions: parameters of all frames. A range has one value for each frame.
+        table: a mapping of parameters for each frame.
+        together: whether all ranges advance together, frame by frame. Otherwise there is a frame
+            for every combination of values; the last range changes fastest. A table is one more
+            range, before the others.
 
     Raises:
-        SequenceError: nothing makes frames, or ranges that go on together differ in length, or a
-            parameter is given twice.
+        SequenceError: there is neither a range nor a table, or ranges that advance together differ
+            in length, or a parameter is given twice.
     """
     common, ranges = {}, []
     if table:
@@ -90,10 +90,11 @@ def frames_of(
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Rows of a table of parameters, separated by commas, semicolons or tabs; names first.
+    """Rows of a table of parameters. Commas, semicolons or tabs separate its columns, and its first
+    line has the names.
 
     Raises:
-        SequenceError: there is no row, or one of another length.
+        SequenceError: there is no row, or a row has another length.
     """
     text = path.read_text("utf-8-sig")
     heading = text.partition("\n")[0]
@@ -116,15 +117,16 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 
 def names_of(template: str, frames: Sequence[Mapping[str, str]]) -> list[Path]:
-    """Files of frames, such as ``{index:04}_{alpha}.exr`` describes them.
+    """File names of frames, from a template such as ``{index:04}_{alpha}.exr``.
 
     Args:
-        template: may have the field ``index``, which counts from 0, and as fields the parameters
-            that all frames have; numbers may have formats.
+        template: its fields may be ``index``, which counts from 0, and the names of parameters that
+            all frames have. Numbers may have formats.
+        frames: the parameters of each frame.
 
     Raises:
-        SequenceError: a field is none of these, or two frames have the same name, or a value would
-            lead into another folder.
+        SequenceError: a field is unknown, or two frames have the same name, or a value would lead
+            into another folder.
     """
     fields = {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
     known = {"index", *set.intersection(*(set(frame) for frame in frames))}
@@ -163,7 +165,7 @@ def _number(text: str) -> int | float | str:
 
 
 def colours(path: Path) -> np.ndarray:
-    """The colours of an image file as a screen shows them: (height, width, 3) uint8."""
+    """The colours of an image file as sRGB: (height, width, 3) uint8."""
     bitmap = mi.Bitmap(str(path))
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = bitmap.split()[0][1]
@@ -171,9 +173,10 @@ def colours(path: Path) -> np.ndarray:
 
 
 def sheet(images: Sequence[Path], columns: int | None = None) -> mi.Bitmap:
-    """All images side by side, made smaller where they are large, row by row.
+    """A contact sheet: all images row by row, reduced to :data:`THUMBNAIL`.
 
     Args:
+        images: image files.
         columns: images in a row; None for about as many as there are rows.
     """
     from skimage.transform import resize
@@ -197,10 +200,10 @@ def sheet(images: Sequence[Path], columns: int | None = None) -> mi.Bitmap:
 
 
 def require_ffmpeg() -> str:
-    """The program ffmpeg.
+    """The path of the program ffmpeg.
 
     Raises:
-        SequenceError: there is none.
+        SequenceError: it is not installed.
     """
     program = shutil.which("ffmpeg")
     if program is None:
@@ -209,27 +212,28 @@ def require_ffmpeg() -> str:
 
 
 def write_video(images: Sequence[Path], path: Path, rate: float) -> None:
-    """Make a video of image files of one size.
+    """Make a video from image files of the same size.
 
     Args:
-        path: its suffix tells ffmpeg the format.
+        images: image files, one per frame.
+        path: the video; its suffix determines the format.
         rate: frames per second.
 
     Raises:
-        SequenceError: there is no ffmpeg, or it fails; the message is its last line.
+        SequenceError: ffmpeg is not installed, or it fails; the message is its last line.
     """
     height, width = colours(images[0]).shape[:2]
     command = [
         *(require_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"),
         *("-s", f"{width}x{height}", "-r", str(rate), "-i", "-"),
-        # Many formats want even sizes.
+        # Many formats need even sizes.
         *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", str(path)),
     ]
     with tempfile.TemporaryFile() as messages:
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
         try:
             pipe = cast(IO[bytes], process.stdin)
-            with contextlib.suppress(BrokenPipeError):  # it has ended, and says why below
+            with contextlib.suppress(BrokenPipeError):  # ffmpeg has ended; the reason is read below
                 for image in images:
                     pipe.write(colours(image).tobytes())
                 pipe.close()

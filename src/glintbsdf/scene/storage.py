@@ -1,8 +1,8 @@
-"""Files of what is done: units, merged images, and checkpoints made of them.
+"""Files of finished work: units, merged images, and the checkpoints that consist of them.
 
-Every file carries a digest of its content, and is there whole or not at all: it is written beside
-its place, brought to the disk, and moved there. A file that a disk has damaged all the same is
-noticed when it is read.
+Every file starts with a digest of its content, so a damaged file is noticed when it is read. A file
+is complete or does not exist: it is written under a temporary name, synchronised to the disk, and
+renamed.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from glintbsdf.scene.passes import Tile
 #: The format of a checkpoint's files. Files with another number cannot be read.
 FORMAT = 1
 
-#: Units between two files of merged sums. At most so many are made again where one file is damaged,
-#: and twice as many files of units are kept.
+#: Number of units between two files of merged sums. If such a file is damaged, at most this many
+#: units are merged again; twice as many files of units are kept for this.
 UNITS_PER_SNAPSHOT = 16
 
 _DIGEST = 32  # bytes
 
 
 class Damaged(Exception):
-    """A file does not hold what was written."""
+    """A file does not contain what was written to it."""
 
 
 class Refused(ValueError):
-    """A checkpoint belongs to another rendering."""
+    """A checkpoint cannot be used: it belongs to another rendering, or is damaged."""
 
 
 # ------------------------------------------------------------------------------------------------
@@ -43,11 +43,11 @@ class Refused(ValueError):
 
 
 def write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a file that appears whole, and survives a loss of power once this returns.
+    """Write arrays to a file, at once. After the return, the file survives a loss of power.
 
     Raises:
-        OSError: the file cannot be written, as where the disk is full. The message names the file.
-            What was there before stays.
+        OSError: the file cannot be written, for example as the disk is full. The message names the
+            file. An older file of this name stays.
     """
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]  # an array may have any name
@@ -72,7 +72,7 @@ def write_bytes(path: Path, head: bytes, buffer: io.BytesIO) -> None:
 
 
 def _bring_to_disk(folder: Path) -> None:
-    """Make the names in a folder survive a loss of power, where the system can do that."""
+    """Synchronise the names in a folder to the disk, on systems that can do so."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -85,7 +85,7 @@ def read(path: Path) -> dict[str, np.ndarray] | None:
     """The arrays of a file; None if there is none.
 
     Raises:
-        Damaged: the file does not hold what was written.
+        Damaged: the file does not contain what was written.
     """
     try:
         content = path.read_bytes()
@@ -101,7 +101,7 @@ def read(path: Path) -> dict[str, np.ndarray] | None:
 
 
 class UnitFiles:
-    """Units that are done, a file for each, in a folder."""
+    """Finished units in a folder, one file for each."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -110,15 +110,15 @@ class UnitFiles:
         return self.folder / f"unit-{index:08d}.glint"
 
     def save(self, index: int, tile: Tile, sums: np.ndarray) -> None:
-        """Keep the sums of a unit, and the tile that they belong to."""
+        """Write the tile and the sums of a unit."""
         corners = np.array([tile.x, tile.y, tile.width, tile.height], np.int64)
         write(self.path(index), {"tile": corners, "sums": sums, "index": np.array(index, np.int64)})
 
     def load(self, index: int) -> tuple[Tile, np.ndarray] | None:
-        """The tile and the sums of a unit, None if it is not there.
+        """The tile and the sums of a unit; None if there is no file.
 
         Raises:
-            Damaged: the file does not hold what was saved.
+            Damaged: the file does not contain what was saved.
         """
         arrays = read(self.path(index))
         if arrays is None:
@@ -137,19 +137,19 @@ class UnitFiles:
 
 
 class Checkpoint:
-    """A folder that keeps what is done of an image.
+    """A folder with the finished part of an image.
 
-    It holds a description of the image and the units that are done. Every
-    :data:`UNITS_PER_SNAPSHOT` units it also gets the sums of all units so far. It keeps the last
-    two such files, and the units since the former of them. The folder's size does not depend on
-    the number of samples.
+    It contains a description of the image, and the finished units. After every
+    :data:`UNITS_PER_SNAPSHOT` units, the sums of all units so far are written as well. The last two
+    of these files are kept, and the units since the older one. So the folder's size does not depend
+    on the number of samples.
 
     Args:
-        folder: the folder; it is made if it is not there.
-        description: what decides the image, in words and numbers that JSON can write.
+        folder: the folder; it is created if it does not exist.
+        description: everything that determines the image, as values that JSON can represent.
 
     Raises:
-        Refused: the folder holds what is done of another image, or by another version.
+        Refused: the folder belongs to another image or to another version.
         OSError: the folder cannot be written.
     """
 
@@ -173,7 +173,7 @@ class Checkpoint:
             raise Refused(_difference(folder, known, description))
 
     def restore(self, image: Image) -> None:
-        """Give an empty image what is done, as far as it is merged."""
+        """Restore the sums of an empty image from the latest file that is not damaged."""
         for path in sorted(self.folder.glob("sums-*.glint"), reverse=True):
             try:
                 arrays = read(path)
@@ -187,7 +187,7 @@ class Checkpoint:
             return
 
     def progressed(self, image: Image) -> None:
-        """Called after each unit that is merged."""
+        """Write the sums if enough units were merged. To be called after each unit."""
         if image.sums is None or image.odd is None:
             return
         if image.count % UNITS_PER_SNAPSHOT and image.count < len(image.plan):
@@ -209,7 +209,7 @@ class Checkpoint:
 
 
 def _difference(folder: Path, known: Mapping[str, object], wanted: Mapping[str, object]) -> str:
-    """A sentence about what a checkpoint and a rendering differ in."""
+    """A sentence about the first difference of a checkpoint and a rendering."""
     for key in {**wanted, **known}:
         if known.get(key) != wanted.get(key):
             break

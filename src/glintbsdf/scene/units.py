@@ -1,10 +1,10 @@
-"""Units of work: how an image is divided.
+"""Units of work: the division of an image.
 
-A unit is some samples in each pixel of a part of the image, drawn from a seed of its own. The plan
-of an image follows from the image alone: its pixels, its samples, its seed. Whoever renders a
-unit, and in whatever order, the unit's sums are the same to the last bit, see
-:mod:`~glintbsdf.scene.passes`, and so is the image, see :mod:`~glintbsdf.scene.merging`. A unit
-needs the same memory for any number of samples in all.
+A unit has a few samples in each pixel of a part of the image, and its own seed. The plan of an
+image depends only on the image: on its pixels, its samples and its seed. The sums of a unit are the
+same to the last bit on every machine and in every order (:mod:`~glintbsdf.scene.passes`), and so is
+the image (:mod:`~glintbsdf.scene.merging`). The memory that a unit needs does not depend on the
+number of samples of the image.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import mitsuba as mi
 
 from glintbsdf.scene.passes import Tile
 
-#: Samples of a unit, at least, where the image has so many.
+#: Smallest number of samples of a unit, if the image has as many.
 FEWEST = 1 << 18
 
-#: Samples of a unit, at most: this bounds the memory of a unit that is rendered.
+#: Largest number of samples of a unit. It bounds the memory for rendering a unit.
 MOST = 1 << 21
 
 
@@ -30,13 +30,14 @@ class Unit:
     """Some samples of an image.
 
     Attributes:
-        index (int): its number in the plan, which is the order of merging.
-        part (int): the number of its pass: all tiles of a pass make one image of few samples.
+        index (int): its number in the plan, by which units are merged.
+        part (int): number of its pass. All tiles of a pass together are the whole image with a few
+            samples.
         tile (Tile): the pixels that get samples.
-        spp (int): samples in each of them.
+        spp (int): samples in each of these pixels.
         seed (int): seed of the sampler.
-        stratified (bool): the samples of a pixel must stay together.
-        divisible (bool): the integrator can render a part of the tile.
+        stratified (bool): whether the samples of a pixel must stay together.
+        divisible (bool): whether the integrator can render a part of the tile.
     """
 
     index: int
@@ -48,9 +49,9 @@ class Unit:
     divisible: bool
 
     def halves(self) -> tuple[Unit, Unit] | None:
-        """Two units of half the samples that take the place of this one; None if it has only one.
+        """Two units with half of the samples that replace this one; None if it cannot be divided.
 
-        They draw other samples, so the image has other noise of the same size.
+        They draw different samples. So the noise of the image is different, but of the same size.
         """
         seeds = [derived_seed(self.seed, 1 + half) for half in range(2)]
         tile = self.tile
@@ -85,9 +86,9 @@ class Plan(Sequence[Unit]):
 
     Attributes:
         film (Tile): the pixels of the image.
-        spp (int): its samples per pixel.
-        seed (int): decides the image.
-        stratified (bool): whether the sampler wants the samples of a pixel together.
+        spp (int): samples per pixel of the image.
+        seed (int): seed of the image.
+        stratified (bool): whether the samples of a pixel must stay together.
         divisible (bool): whether the integrator can render a part of the pixels.
     """
 
@@ -99,21 +100,21 @@ class Plan(Sequence[Unit]):
 
     @cached_property
     def parts(self) -> int:
-        """Number of passes; their samples differ by one at most."""
+        """Number of passes; their numbers of samples differ by at most one."""
         if self.stratified:
             return 1
         return max(1, min(self.spp, self.spp * self.film.pixels // FEWEST))
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:
-        """Whole rows of pixels, or parts of a row where even one row has too many samples."""
+        """Tiles of whole rows of pixels, or parts of a row if one row has too many samples."""
         film = self.film
         if not self.divisible:
             return (film,)
         most = max(1, MOST // -(-self.spp // self.parts))
         width = film.width if most >= film.width else most
         height = max(1, most // film.width)
-        # Tiles of sizes as equal as can be.
+        # All tiles have about the same size.
         rows, columns = -(-film.height // height), -(-film.width // width)
         return tuple(
             Tile(film.x + x0, film.y + y0, x1 - x0, y1 - y0)
@@ -138,18 +139,18 @@ class Plan(Sequence[Unit]):
         tiles = self.tiles
         part, tile = divmod(index, len(tiles))
         start, end = _range(self.spp, self.parts, part)
-        # Seeds of neighbouring images must not share units.
+        # Units of images with successive seeds must not have the same seed.
         seed = derived_seed(self.seed, index) if len(self) > 1 else self.seed
         return Unit(index, part, tiles[tile], end - start, seed, self.stratified, self.divisible)
 
 
 def derived_seed(seed: int, index: int) -> int:
-    """The seed of the part numbered ``index`` of what has the seed ``seed``."""
+    """The seed of part number ``index`` of an image or unit with the seed ``seed``."""
     return int(mi.sample_tea_32(seed, index)[0])
 
 
 def _range(size: int, count: int, index: int) -> tuple[int, int]:
-    """Where one of ``count`` parts of 0…``size`` begins and ends."""
+    """Begin and end of one of ``count`` parts of 0…``size``."""
     return size * index // count, size * (index + 1) // count
 
 
