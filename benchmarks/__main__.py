@@ -61,7 +61,7 @@ def fresh_caches() -> Iterator[None]:
 
 def run() -> NoReturn:
     """Run the command line. The exit status is 1 where it was interrupted."""
-    from glintbsdf.cli.entry import interruptible
+    from glintbsdf.core.interruption import interruptible
 
     try:
         with interruptible():

@@ -41,7 +41,7 @@ from benchmarks.methods import NARROWEST_LOBE, NO_MAP, STIFF, VERTICAL, WIDTHS, 
 from benchmarks.report import page
 from glintbsdf.check import densities, robustness
 from glintbsdf.check.suite import View
-from glintbsdf.cli.entry import interruptible
+from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.scene.rendering import replacing
 

@@ -1,7 +1,8 @@
-"""Densities of half vectors by adaptive quadrature, however narrow their spikes.
+"""Integrals of densities of half vectors by adaptive quadrature, however narrow their spikes.
 
-A P-NDF may hold half of its mass in needles of 1e-5, which no grid of bins resolves: cells are
-shaped around points that are drawn from it, and refined where points and density disagree.
+A P-NDF may have half of its mass in spikes with a width of 1e-5, which no grid of bins resolves. So
+cells are shaped around points that are drawn from the P-NDF, and refined where points and density
+disagree.
 """
 
 from __future__ import annotations
@@ -17,22 +18,23 @@ from glintbsdf.check.suite import View
 
 Array = np.ndarray
 
-#: Cells are not cut below this width: a normal recovered from ``wo`` has errors of about 1e-7.
+#: Cells narrower than this are not cut: a normal recovered from ``wo`` has errors of about 1e-7.
 NARROWEST = 2e-5
-#: A cell with so few training points is not cut.
+#: A cell with at most this many training points is not cut.
 LEAF = 32
-#: The quadrature refines until its standard error is this, if it can within these limits.
+#: The quadrature refines until its standard error is TARGET, but for at most ROUNDS rounds, and
+#: about MOST_BOXES boxes.
 TARGET, ROUNDS, MOST_BOXES = 3e-4, 24, 16_000
 #: Points along each side of a box.
 STRATA = 4
 
 
 def partition(points: Array) -> tuple[Array, Array]:
-    """Cut the square [−1, 1]² into cells that hold few of ``points`` (N, 2) each.
+    """Cut the square [−1, 1]² into cells that have few of ``points`` (N, 2) each.
 
-    Empty margins and gaps are cut off first, so that the cells close around clusters of points of
-    any size; then each cut halves the number of points. Returns the cells (K, 2, 2: lower and upper
-    corner), and the cell of each point.
+    Empty margins and gaps are cut off first, so that cells enclose clusters of points of any size
+    tightly. Further cuts halve the number of points. Returns the cells (K, 2, 2: lower and upper
+    corner), and the index of the cell of each point.
     """
     cells: list[np.ndarray] = []
     cell_of = np.empty(len(points), np.int64)
@@ -53,7 +55,7 @@ def partition(points: Array) -> tuple[Array, Array]:
 
 
 def cut_of(box: Array, points: Array) -> tuple[int, float] | None:
-    """Where to cut a cell, as axis and place; None where a cut makes no sense any more."""
+    """The axis and the position at which to cut a cell; None if it should not be cut."""
     low, high = points.min(0), points.max(0)
     margin = 0.1 * (high - low) + NARROWEST
     empty = np.stack([low - margin - box[0], box[1] - high - margin]) / (box[1] - box[0])
@@ -69,24 +71,25 @@ def cut_of(box: Array, points: Array) -> tuple[int, float] | None:
     if gaps[widest] < 0.25 * (high[axis] - low[axis]):
         widest = len(ordered) // 2
     place = 0.5 * (ordered[widest] + ordered[widest + 1])
-    # Half of the points may be one and the same, as float32 normals of a narrow lobe are.
+    # Half of the points may be equal, as float32 normals of a narrow lobe are.
     return axis, place if place > low[axis] else 0.5 * (low[axis] + high[axis])
 
 
 def count_in(cells: Array, points: Array) -> Array:
-    """How many of ``points`` (N, 2) lie in each cell."""
+    """The number of ``points`` (N, 2) in each cell."""
     return np.array([((points >= low) & (points < high)).all(1).sum() for low, high in cells])
 
 
 def mass_of(density: Callable, cells: Array, points: Array, cell_of: Array) -> tuple[Array, Array]:
     """Integral of ``density`` over each cell, and its standard error, by adaptive quadrature.
 
-    Boxes, at first the cells, are cut in four where jittered points disagree with each other, or
-    with the number of ``points``, samples of the density, in them; once there are very many, where
-    they disagree with the samples alone. The integral is then taken by fresh points.
+    The quadrature uses boxes, which are at first the cells. A box is cut in four where the values
+    at its jittered points differ, or where their mean disagrees with the number of ``points`` in
+    it, which are samples of the density. With very many boxes, only the second condition counts. At
+    the end, new points give the integral.
     """
     rng = np.random.default_rng(5)
-    count = max(len(points), 1)  # none, where all facets reflect the view below the horizon
+    count = max(len(points), 1)  # there is none if all facets reflect the view below the horizon
 
     def estimate(boxes: Array, strata: int) -> tuple[Array, Array]:
         n = strata * strata
@@ -101,10 +104,10 @@ def mass_of(density: Callable, cells: Array, points: Array, cell_of: Array) -> t
     mass, error = estimate(boxes, STRATA)
     for _ in range(ROUNDS):
         share = np.bincount(box_of, minlength=len(boxes)) / count
-        # Points where the quadrature has found next to nothing: it has missed a spike.
+        # Many points where the quadrature has found almost nothing: it has missed a spike.
         missed = share > mass + 3 * np.sqrt((mass + 0.1 / count) / count) + 2 * error
         doubt = np.maximum(error, np.where(missed, share - mass, 0))
-        # The boxes that make up most of the doubt: the aim is boxes of equal doubt.
+        # Cut the boxes with the largest errors: in the end all have about the same error.
         cut = doubt > min(0.5 * doubt.max(), TARGET / np.sqrt(len(boxes)))
         if len(boxes) > MOST_BOXES:
             cut &= missed
@@ -139,12 +142,15 @@ def quarters(boxes: Array) -> Array:
 
 
 def density(bsdf: mi.BSDF, view: View, samples: int) -> dict[str, float]:
-    """The density of half vectors on the disk: is it normalised, and is it what is drawn?
+    """Test the density of half vectors on the disk: its normalisation, and the sampler.
 
-    ``mass``: ∫ pdf + share of invalid samples − 1, with the standard error ``mass_error``; a sample
-    is invalid where the normal reflects the view below the horizon, where the pdf is 0 as well.
-    ``p_value`` comes from Pearson's χ² test of half of the samples against the pdf, in cells that
-    the other half has shaped.
+    Returns
+
+    * ``mass``: ∫ pdf + share of invalid samples − 1, which must be 0. A sample is invalid if its
+      normal reflects the view below the horizon, where the pdf is 0;
+    * ``mass_error``: standard error of ``mass``;
+    * ``p_value`` of Pearson's χ² test of half of the samples against the pdf, in cells that the
+      other half has shaped.
     """
     si, bs, _ = suite.sample(bsdf, view, 2 * samples, seed=3)
     m = np.array(dr.normalize(si.wi + bs.wo), np.float64)[:2].T
@@ -160,7 +166,7 @@ def density(bsdf: mi.BSDF, view: View, samples: int) -> dict[str, float]:
     cells, cell_of = partition(training)
     mass, error = mass_of(at, cells, training, cell_of)
     lost = 1 - valid.mean()
-    # With no sample to test, the density must be zero, which its integral tells.
+    # Without a sample to test, the density must be zero, which ``mass`` shows.
     p_value = 1.0
     if valid.any():
         p_value = suite.p_value(count_in(cells, test), samples, mass, error)

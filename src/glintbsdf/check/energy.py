@@ -1,10 +1,11 @@
-"""Energy: what a BSDF reflects of uniform light, place by place, and what a real surface does.
+"""Energy: the share of uniform light that a BSDF reflects at each place, and ray tracing of the
+displaced surface.
 
-The truth needs no P-NDF and no masking. A height field of mirrors, displaced, is a mesh of
-triangles: a ray from the viewer meets a facet, and counts if, once reflected, it leaves without
-meeting the surface again. The share of such rays is the directional albedo of single scattering,
-which a microfacet BRDF stands for. Given as a normal map, the same surface is what a BSDF is asked
-about, at places under footprints of a few texels.
+The reference needs neither a P-NDF nor masking. A displaced height field of mirrors is a mesh of
+triangles. A ray from the viewer hits a facet, and counts if its reflection leaves without hitting
+the surface again. The share of such rays is the directional albedo of single scattering, which a
+microfacet BRDF approximates. The BSDF gets the normal map of the same surface, and is evaluated at
+random places, under footprints of a few texels.
 """
 
 from __future__ import annotations
@@ -24,11 +25,10 @@ class Surface:
     """A periodic height field with Gaussian heights, autocorrelation exp(−(r/``length``)²).
 
     Args:
-        size (int): texels along either axis, of one texel's width each.
-        slope (float): standard deviation of the slope along either axis; that of the continuous
-            surface, the sum of waves.
+        size (int): texels along each axis.
+        slope (float): standard deviation of the slope along each axis, of the continuous surface.
         length (float): correlation length, texels; waves shorter than 4 texels must be weak.
-        seed (int): another number gives another surface.
+        seed (int): seed of the surface.
     """
 
     size: int = 256
@@ -48,7 +48,7 @@ class Surface:
         return waves * (self.slope / np.sqrt(0.5 * squared_slope)), y, x
 
     def normal_map(self) -> NormalMap:
-        """The normals of the surface at its texels, exact."""
+        """The exact normals of the surface at its texels."""
         waves, y, x = self.spectrum()
         gradient = np.stack([np.fft.ifft2(1j * k * waves).real for k in (x, y)], axis=2)
         normals = -gradient / np.sqrt(1 + (gradient**2).sum(axis=2, keepdims=True))
@@ -64,7 +64,7 @@ class Surface:
         return np.fft.ifft2(padded).real * refinement**2
 
     def scene(self, refinement: int, border: float) -> mi.Scene:
-        """The displaced surface as a mesh: one period and ``border`` texels more on each side."""
+        """The displaced surface as a mesh: one period, and ``border`` more texels on each side."""
         heights = self.heights(refinement)
         count = int(round((self.size + 2 * border) * refinement)) + 1
         index = np.arange(count) - round(border * refinement)
@@ -85,10 +85,20 @@ class Surface:
 def traced_energy(
     surface: Surface, angle: float, rays: int, refinement: int = 2, seed: int = 1
 ) -> float:
-    """Share of the rays from ``angle`` (degrees) that leave the surface after one reflection.
+    """Share of the rays that leave the surface after one reflection.
 
-    Views come from all around. Rays begin and end ``border`` texels beyond the part of the surface
-    that they are aimed at, high above it; one so flat that it would go further counts as leaving.
+    Args:
+        surface: the surface.
+        angle: angle of incidence, degrees; azimuths are random.
+        rays: number of rays.
+        refinement: vertices of the mesh per texel, along each axis.
+        seed: seed of the rays.
+
+    The mesh has half a period more on each side than the part that rays aim at. A reflected ray
+    that is so flat that it reaches the border of the mesh counts as leaving.
+
+    Raises:
+        ParameterError: the angle is so grazing that rays miss the mesh.
     """
     border = 0.5 * surface.size
     scene = surface.scene(refinement, border)
@@ -108,7 +118,7 @@ def traced_energy(
     ray = si.spawn_ray(wo)
     leaves &= ~scene.ray_test(ray, leaves)
     met = np.array(si.is_valid())
-    # A ray in a hundred thousand slips between two triangles.
+    # A few rays may slip between two triangles.
     check(met.mean() > 1 - 1e-3, "traced_energy", "angle", "less grazing: rays miss", angle)
     return float(np.array(leaves)[met].mean())
 
@@ -116,12 +126,15 @@ def traced_energy(
 def energies(
     bsdf: mi.BSDF, texels: int, sigma: float, angle: float, places: int, samples: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the BSDF reflects of uniform light at random places, seen from random sides.
+    """The share of uniform light that the BSDF reflects at random places, from random azimuths.
 
     Args:
-        texels (int): of the map, along either axis.
+        bsdf: the BSDF.
+        texels (int): texels of its map along each axis.
         sigma (float): standard deviation of the round footprints, texels.
-        samples (int): per place.
+        angle (float): angle of incidence, degrees.
+        places (int): number of places.
+        samples (int): samples per place.
 
     Returns:
         The energy of each place, and its standard error.

@@ -1,14 +1,14 @@
-"""Values of every kind for every parameter of every plugin: each is used, or refused in a sentence.
+"""Fuzzing of parameters: values of every kind for every parameter of every plugin.
 
-A case is a plugin and one or two of its parameters with values of any kind: numbers from 1e-45 to
-1e39, NaN, names, colours, vectors, transforms, tensors, images, textures, nested materials; and
-parameters that do not exist. It must end in one of two ways: with an error of one sentence that
-names the plugin and the parameter that was written; or with a BSDF that evaluates and samples to
-finite numbers from the zenith to the horizon, for footprints from a point to many maps.
+A case is a plugin, and values of any kind for one or two of its parameters: numbers from 1e-45 to
+1e39, NaN, names, colours, vectors, transforms, tensors, images, textures, nested materials. Some
+parameters do not exist. A case must end in one of two ways: with an error of one sentence that
+names the plugin and the parameter; or with a BSDF whose values and samples are finite from the
+zenith to the horizon, for footprints from a point to many maps.
 
 :func:`cases` and :func:`outcome` work in this process. :func:`fuzz` runs any number of cases in
-processes of their own, so that crashes and endless loops are outcomes as well. It is the long check
-of the stability report::
+separate processes, so that crashes and endless loops are outcomes as well. It is the long check of
+the stability report::
 
     from glintbsdf.check.fuzz import fuzz
     print(fuzz(20_000, seed=1))
@@ -26,13 +26,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-#: Seconds that a case may take; a new kernel alone takes some.
+#: Seconds that a case may take, with the compilation of its kernels.
 PATIENCE = 60.0
 
-#: Values beyond these are allowed and take long, as there is much to build.
+#: Larger values than these are allowed, but take long to build; cases use these at most.
 _COSTLY = {"output_size": 128, "flake_density": 1e5}
 
-#: What a case may end as; anything else is a fault.
+#: The good outcomes of a case; any other outcome is a fault.
 GOOD = ("used", "refused", "refused by Mitsuba")
 
 _NUMBERS = (0, 1, -1, 7, 2**31, 2**40, -(2**40))
@@ -73,7 +73,8 @@ _NAMES = (
 
 
 class Case(NamedTuple):
-    """A plugin and what is written of its parameters, as makers of values by name."""
+    """A plugin and some of its parameters: by name, the kind of a value and a number or name for
+    it, see :func:`made`."""
 
     plugin: str
     changes: dict[str, tuple[str, Any]]
@@ -86,8 +87,8 @@ class Case(NamedTuple):
 
 
 def cases(seed: int, count: int, plugins: tuple[str, ...] = ()) -> Iterator[Case]:
-    """``count`` cases, the same for the same seed, for ``plugins`` or for all that declare
-    parameters."""
+    """``count`` cases, for ``plugins``, or for all plugins that declare parameters. The same seed
+    gives the same cases."""
     from glintbsdf.bridge.parameters import PARAMETERS, Number
 
     rng = np.random.default_rng(seed)
@@ -205,9 +206,9 @@ def base(plugin: str) -> dict:
 
 
 def outcome(case: Case, evaluate: bool = True) -> str:
-    """What comes of a case: one of :data:`GOOD`, or a sentence about the fault.
+    """The outcome of a case: one of :data:`GOOD`, or a sentence about the fault.
 
-    ``evaluate``: whether a BSDF that loads is evaluated as well, for which kernels are compiled.
+    ``evaluate``: whether to evaluate the BSDF as well, which compiles kernels.
     """
     import mitsuba as mi
 
@@ -230,7 +231,8 @@ def outcome(case: Case, evaluate: bool = True) -> str:
 
 
 def judged(case: Case, message: str) -> str:
-    """Whether an error is a sentence that names the plugin and a parameter that was written."""
+    """The outcome of an error: it must be one sentence that names the plugin and a parameter of the
+    case."""
     lines = message.strip().splitlines()
     if "Traceback" in message or len(lines) != 1:
         return "no sentence: " + lines[-1]
@@ -248,7 +250,7 @@ def judged(case: Case, message: str) -> str:
 
 
 def judged_values(bsdf: Any) -> str:
-    """Whether values, densities and samples of a BSDF are finite and not negative."""
+    """The outcome of a BSDF: its values, densities and samples must be finite and ≥ 0."""
     import drjit as dr
     import mitsuba as mi
 
@@ -300,8 +302,8 @@ class Report:
     """Outcomes of many cases.
 
     Attributes:
-        counts: how often each good outcome, and "fault", came.
-        faults: what came of each case that ended otherwise.
+        counts: number of cases with each good outcome, and with "fault".
+        faults: the cases that are faults, with their outcomes.
         slowest: seconds of the slowest case, and the case.
     """
 
@@ -310,6 +312,7 @@ class Report:
     slowest: tuple[float, str] = (0.0, "")
 
     def add(self, case: Case, result: str, seconds: float = 0.0) -> None:
+        """Count the outcome of a case."""
         good = result in GOOD
         self.counts[result if good else "fault"] += 1
         if not good:
@@ -331,9 +334,9 @@ def fuzz(
     plugins: tuple[str, ...] = (),
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Report:
-    """Run ``count`` cases in ``workers`` processes of their own, whose ends are outcomes, too.
+    """Run ``count`` cases in ``workers`` separate processes. The death of a process is an outcome.
 
-    ``plugins`` as in :func:`cases`; ``report`` is called with the fraction done.
+    ``plugins`` as in :func:`cases`; ``report`` is called with the fraction that is done.
     """
     context = multiprocessing.get_context("spawn")
     result = Report()
@@ -407,7 +410,8 @@ def _activate(variant: str) -> None:
 
 
 def _work(connection, seed: int, count: int, variant: str, plugins: tuple[str, ...]) -> None:
-    """Take numbers of cases, give outcomes; the first message says that all is ready."""
+    """A worker process: it receives indices of cases and sends outcomes. Its first message says
+    that it is ready."""
     every = _known_cases(seed, count, variant, plugins)
     connection.send("ready")
     while (index := connection.recv()) is not None:

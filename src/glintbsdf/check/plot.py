@@ -1,4 +1,4 @@
-"""A picture that puts a plugin's P-NDF beside the binned reference, with the error and the time."""
+"""A drawing of a plugin's P-NDF beside the binned reference, with the error and the time."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from glintbsdf.footprint.gaussian import Footprint
 # Points per bin and axis at which the density is evaluated: the reference is the mean over a bin.
 _SUBSAMPLES = 4
 
-# Brightness is this power of density: a few peaks would leave all else black.
+# Brightness is this power of the density: otherwise a few peaks would leave everything else black.
 _GAMMA = 0.5
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A P-NDF on the bins of its reference.
+    """A P-NDF in the bins of its reference.
 
-    ``density`` is res x res, rows from low to high y, each element the mean over random points of
-    its bin, and ``standard_error`` the standard error of this mean. ``seconds`` is the time of the
-    ``queries`` evaluations of the density, compilation excluded.
+    Attributes:
+        density: mean of D over random points of each bin, res x res, rows from low to high y.
+        standard_error: standard error of these means.
+        reference: the binned reference.
+        queries: number of evaluations of the density.
+        seconds: their time, without the compilation.
     """
 
     density: np.ndarray
@@ -46,10 +49,10 @@ class Comparison:
 
     @property
     def noise(self) -> float:
-        """The relative L1 difference expected of an exact density, from the noise of both grids.
+        """The expected relative L1 difference of an exact density, from the noise of both grids.
 
-        The mean of |x| of a Gaussian is √(2/π) of its standard deviation. Bins in which neither
-        grid has found anything are left out.
+        The mean of |x| is √(2/π) times the standard deviation, for a Gaussian. Bins without a
+        sample of the reference have no noise of the reference.
         """
         reference = np.where(self.reference.density > 0, self.reference.standard_error, 0)
         deviation = np.hypot(self.standard_error, reference)
@@ -79,11 +82,12 @@ def compare(
 
     Args:
         plugin: type of a glint BSDF.
+        map_file: its map.
         uv: centre of the footprint in UV.
-        sigma: its standard deviation in texels.
+        sigma: standard deviation of the footprint in texels.
         res: bins along each axis, over the range of the map's normals.
         parameters: further parameters of the plugin, as strings.
-        samples_per_bin: samples of the reference in a bin, on average.
+        samples_per_bin: mean number of samples of the reference in a bin.
 
     Raises:
         ParameterError: the plugin has no P-NDF to draw.
@@ -126,13 +130,13 @@ def compare(
 
     points = density.reshape(res, _SUBSAMPLES, res, _SUBSAMPLES)
     mean = points.mean(axis=(1, 3), dtype=np.float64)
-    # Stratified points have less noise than this.
+    # An upper bound: stratified points have less noise.
     standard_error = points.std(axis=(1, 3), dtype=np.float64, ddof=1) / _SUBSAMPLES
     return Comparison(mean, standard_error, reference, count * count, seconds)
 
 
 def colour_map(value: np.ndarray) -> np.ndarray:
-    """Map [0, 1] to linear RGB from black through blue and orange to white, brightness rising."""
+    """Map [0, 1] to linear RGB: from black through blue and orange to white, ever brighter."""
     stops = np.linspace(0, 1, 5)
     colours = np.array(
         [[0, 0, 0], [0.05, 0.05, 0.35], [0.55, 0.1, 0.25], [1, 0.5, 0.05], [1, 1, 0.85]]
@@ -141,7 +145,7 @@ def colour_map(value: np.ndarray) -> np.ndarray:
 
 
 def _typed(parameters: Mapping[str, str]) -> dict[str, bool | int | float | str]:
-    """Give strings the type that their spelling suggests, as Mitsuba's dictionaries want it."""
+    """Convert strings to the types that their spelling suggests, as Mitsuba's dictionaries need."""
 
     def typed(text: str) -> bool | int | float | str:
         if text in ("true", "false"):

@@ -1,16 +1,16 @@
-"""The reference: a P-NDF by brute force, in NumPy's float64, sharing nothing with the estimators.
+"""The reference: a P-NDF by brute force in float64. It shares no code with the estimators.
 
-It follows the definition of the P-NDF word for word: draw positions from the footprint's kernel,
-look up the normal there, count how many land in each bin of a grid over the unit disk. There is no
-approximation but noise, and the noise is known: samples are independent, so counts are binomial.
+It follows the definition of the P-NDF: draw positions from the footprint's kernel, look up the
+normal there, and count the normals in each bin of a grid over the unit disk. The only error is
+noise, and the noise is known: samples are independent, so counts are binomial.
 
 The surface is the mesh of Wu et al. 2024 (Wu24), whose vertices are the texel centres. The quad of
 texels ``n0 = (i, j)``, ``n1 = (i, j+1)``, ``n2 = (i+1, j)``, ``n3 = (i+1, j+1)`` has the triangles
 ``(n0, n1, n2)`` and ``(n3, n2, n1)``, over which the projected normal is linear. A triangle that
-maps to almost a point would make the density infinite: where twice its area on the disk,
-``|det J|``, is below ``epsilon``, an equilateral triangle takes its place, centred at
-``(n1 + n2)/2``, of circumradius ``√(2 epsilon / (3√3))`` so that ``|det J| = epsilon``; its
-corners, in the order above, are seen from the centre at 90°, 210° and 330°.
+maps almost to a point would make the density infinite. So an equilateral triangle replaces each
+triangle whose ``|det J|``, twice its area on the disk, is below ``epsilon``. It is centred at
+``(n1 + n2)/2`` and has the circumradius ``√(2 epsilon / (3√3))``, so that ``|det J| = epsilon``.
+Its corners, in the order above, are at the angles 90°, 210° and 330° from the centre.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from glintbsdf.maps.normalmap import NormalMap
 
 KERNELS = ("gaussian", "disk", "box")
 
-_CHUNK = 1 << 19  # samples at once: enough to hide NumPy's overhead, few enough to stay in cache
+_CHUNK = 1 << 19  # samples at a time: enough to hide NumPy's overhead, and still in the cache
 
 Array = npt.NDArray[np.float64]
 Bounds = tuple[tuple[float, float], tuple[float, float]]
@@ -63,15 +63,16 @@ class BinnedPNDF:
         return (x_max - x_min) * (y_max - y_min) / self.density.size
 
     def relative_l1(self, density: npt.ArrayLike) -> float:
-        """Relative L1 difference ``Σ|density - self.density| / Σ self.density`` to such a grid."""
+        """Relative L1 difference ``Σ|density - self.density| / Σ self.density`` of another grid of
+        the same shape."""
         return float(np.abs(np.asarray(density) - self.density).sum() / self.density.sum())
 
     @property
     def noise_floor(self) -> float:
-        """The :meth:`relative_l1` that an exact density would show, from the noise of this one.
+        """The expected :meth:`relative_l1` of an exact density, from the noise of this one.
 
-        The mean of ``|x|`` of a Gaussian is √(2/π) of its standard deviation. Bins without a sample
-        are left out: they hide less mass than one sample has.
+        The mean of ``|x|`` is √(2/π) times the standard deviation, for a Gaussian. Bins without a
+        sample are left out: their mass is less than that of one sample.
         """
         noise = self.standard_error[self.density > 0].sum() / self.density.sum()
         return float(np.sqrt(2 / np.pi) * noise)
@@ -92,15 +93,25 @@ def binned_pndf(
 ) -> BinnedPNDF:
     """Estimate the P-NDF of a map under a footprint on a grid of ``res`` x ``res`` bins.
 
-    ``uv`` is the footprint's centre. ``covariance`` is its covariance in UV², a symmetric positive
-    semidefinite 2 x 2 matrix; see :func:`texel_covariance` for a footprint given in texels. With ρ
-    the Mahalanobis distance, ``kernel`` is ``gaussian`` (cut at ρ <= 3 and renormalised), ``disk``
-    (uniform over ρ <= 1.5) or ``box`` (uniform over ``|Δu| <= 1.5 σ_u``, ``|Δv| <= 1.5 σ_v``, the
-    covariance's diagonal). ``epsilon`` is the Jacobian clamp, ``sigma_r`` the standard deviation of
-    a further isotropic Gaussian roughness on the disk. ``bounds`` is the rectangle of the grid
-    (default :func:`normal_bounds`); normals outside it count in no bin, so the grid's sum times the
-    bin area is the probability of the rectangle.
-    Raises :class:`~.ParameterError` on bad parameters.
+    Args:
+        normal_map: the map.
+        uv: the footprint's centre.
+        covariance: the footprint's covariance in UV², a symmetric positive semidefinite 2 x 2
+            matrix; see :func:`texel_covariance` for a footprint given in texels.
+        kernel: ``gaussian`` (cut at the Mahalanobis distance ρ = 3 and renormalised), ``disk``
+            (uniform over ρ <= 1.5) or ``box`` (uniform over ``|Δu| <= 1.5 σ_u``,
+            ``|Δv| <= 1.5 σ_v``, from the covariance's diagonal).
+        epsilon: smallest ``|det J|`` of a triangle, >= 0.
+        sigma_r: standard deviation of an additional isotropic Gaussian roughness on the disk, >= 0.
+        res: number of bins along each axis.
+        bounds: rectangle ``((x_min, y_min), (x_max, y_max))`` of the grid; by default
+            :func:`normal_bounds`. Normals outside of it are not counted. So the sum of the grid
+            times the area of a bin is the probability of the rectangle.
+        samples: number of samples.
+        seed: seed of the samples.
+
+    Raises:
+        ParameterError: an argument is not allowed.
     """
     owner = "binned_pndf"
     check_choice(owner, "kernel", kernel, KERNELS)
@@ -147,7 +158,7 @@ def binned_pndf(
 
     bin_area = float(np.prod((upper - lower) / res))
     density = counts / (samples * bin_area)
-    # Binomial, with one more sample of each outcome: never zero, and never too small in the mean.
+    # Binomial, with one more sample of each outcome: then the error is never zero.
     probability = (counts + 1) / (samples + 2)
     standard_error = np.sqrt(probability * (1 - probability) / samples) / bin_area
     return BinnedPNDF(
@@ -162,8 +173,8 @@ def texel_covariance(
 ) -> Array:
     """The UV² covariance of a footprint given in texels.
 
-    ``sigma`` is the standard deviation along both axes, or a pair along two axes of which the first
-    is turned by ``angle`` (radians) from u towards v.
+    ``sigma`` is the standard deviation along both axes, or a pair for two axes. The first of them
+    has the ``angle`` (radians) from u towards v.
     """
     cosine, sine = np.cos(angle), np.sin(angle)
     size = np.array([normal_map.width, normal_map.height])
@@ -172,10 +183,10 @@ def texel_covariance(
 
 
 def normal_bounds(normal_map: NormalMap, epsilon: float = 1e-6, sigma_r: float = 0.0) -> Bounds:
-    """The rectangle that holds every normal of the map's surface.
+    """The rectangle that contains every normal of the map's surface.
 
-    It is widened by the circumradius of a clamped triangle, by 4 ``sigma_r``, and by 1 % on each
-    side, so that no normal lies on its border.
+    It has a margin on each side: the circumradius of a clamped triangle, 4 ``sigma_r``, and 1 %, so
+    that no normal lies on its border.
     """
     normals = normal_map.normals.reshape(-1, 2).astype(np.float64)
     margin = _clamped_circumradius(epsilon) + 4 * sigma_r
@@ -185,7 +196,7 @@ def normal_bounds(normal_map: NormalMap, epsilon: float = 1e-6, sigma_r: float =
 
 
 # -------------------------------------------------------------------------------------------------
-# One step of the estimate each
+# The steps of the estimate
 # -------------------------------------------------------------------------------------------------
 
 
@@ -202,15 +213,15 @@ def _checked_covariance(covariance: npt.ArrayLike, owner: str) -> Array:
 
 
 def _draw_offsets(kernel: str, covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draw positions of a kernel about its centre, a count x 2 array in the covariance's units."""
+    """Draw offsets from a kernel's centre: a count x 2 array, in units of the covariance's root."""
     if kernel == "box":
         return rng.uniform(-1.5, 1.5, (count, 2)) * np.sqrt(np.diag(covariance))
     u, angle = rng.uniform(0, 1, count), rng.uniform(0, 2 * np.pi, count)
     if kernel == "disk":
         radius = 1.5 * np.sqrt(u)
-    else:  # Rayleigh's distribution, cut where a Gaussian has mass 1 - exp(-9/2)
+    else:  # the Rayleigh distribution, cut at ρ = 3, where the Gaussian's mass is 1 - exp(-9/2)
         radius = np.sqrt(-2 * np.log1p(u * np.expm1(-4.5)))
-    # Any root of the covariance whitens; this one exists for singular matrices as well.
+    # Any root of the covariance will do; this one exists for singular matrices as well.
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(variances, 0))
     return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1) @ root.T
@@ -228,7 +239,7 @@ def _normals_at(position: Array, vertices: Array, normal_map: NormalMap, epsilon
         columns = _wrap(column + column_offset, normal_map.width, normal_map.wrap_mode)
         return vertices[rows * normal_map.width + columns]
 
-    # The triangle's corners in its own order: (n0, n1, n2) or (n3, n2, n1).
+    # The corners in the order of their triangle: (n0, n1, n2) or (n3, n2, n1).
     n1, n2 = vertex(0, 1), vertex(1, 0)
     lone = np.where(in_first, 0, 1)
     first = vertex(lone, lone)
@@ -253,7 +264,7 @@ def _clamped_circumradius(epsilon: float) -> float:
 
 
 def _wrap(index: npt.NDArray[np.int64], size: int, wrap_mode: str) -> npt.NDArray[np.int64]:
-    """The texel that stands at any whole-numbered index."""
+    """The texel at any index."""
     if wrap_mode == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap_mode == "mirror":

@@ -1,7 +1,7 @@
-"""How a BSDF bears what is stiff and extreme: functions that return numbers, and do not judge.
+"""Measures of a BSDF's numerical robustness: functions that return numbers and do not judge them.
 
-The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as for the checks of
-:mod:`glintbsdf.check.suite`, whose views are used here.
+The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as in :mod:`glintbsdf.check.suite`,
+whose views are used here.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 # --------------------------------------------------------------------------------------------------
-#  Extremes: many lanes, each a combination of values that break careless code
+#  Extremes: many lanes, each with a combination of values that break careless code
 # --------------------------------------------------------------------------------------------------
 
-#: Larger standard deviation of a footprint (maps), ratio of both, and inclination of a direction.
+#: Larger standard deviation of a footprint (maps), ratio of both standard deviations, and
+#: inclination of a direction (degrees).
 SIZES = (0, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 100)
 RATIOS = (1, 10, 1e2, 1e4)
 INCLINATIONS = (0, 30, 60, 85, 89.9, 89.9999, 90)
 #: Size of the UV coordinates.
 PLACES = (0, 1, 1e3, 1e6)
-#: Radiance of a light: what is reflected of it must be a number as well.
+#: Radiance of a light: its reflection must be finite, too.
 RADIANCE = 1e6
 
 
@@ -54,13 +55,13 @@ def direction(inclination: Array, azimuth: Array) -> Array:
 
 
 def extreme_interaction(count: int, seed: int) -> mi.SurfaceInteraction3f:
-    """Interactions that combine the extremes at random; a quarter of them has no UV partials.
+    """Interactions with random combinations of the extremes; a quarter has no UV partials.
 
     The parameterisation is orthonormal, mirrored (inverted UVs), with parallel partial derivatives,
     almost parallel ones, or none.
     """
     rng = np.random.default_rng(seed)
-    # In order, so that lanes that run together take about as long.
+    # Sorted, so that lanes that run together take about the same time.
     size = np.repeat(SIZES, -(-count // len(SIZES)))[:count]
     ratio, place = rng.choice(RATIOS, count), rng.choice(PLACES, count)
     angle = rng.uniform(0, 2 * np.pi, count)
@@ -87,11 +88,11 @@ def vector(kind: type, values: Array):
 
 
 def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
-    """How many lanes show what is not finite (``nan``), and how many what is ``negative``.
+    """The number of lanes with a value that is not finite (``nan``), or ``negative``.
 
-    It looks at direction, density and weight of samples; at values and densities there and in other
-    directions down to the horizon; and at the albedo. All values are those of light of
-    ``RADIANCE`` that is reflected.
+    The values are the direction, density and weight of samples; values and densities of the BSDF in
+    these directions, and in others down to the horizon; and the albedo. The light has the radiance
+    :data:`RADIANCE`.
     """
     si = extreme_interaction(count, seed)
     u = suite.random_numbers(count, 3, seed)
@@ -116,7 +117,7 @@ def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
         bs.pdf,
         suite.intensity(bsdf.eval_diffuse_reflectance(si)),
     )
-    # One after the other, so that one kernel serves both.
+    # In two calls with opaque values, so that one kernel serves both.
     for wo in (bs.wo, vector(mi.Vector3f, elsewhere)):
         dr.make_opaque(wo)
         value, pdf = bsdf.eval_pdf(ctx, si, wo)
@@ -135,7 +136,7 @@ def extremes(bsdf: mi.BSDF, count: int, seed: int = 1) -> dict[str, int]:
 def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> list[dict[str, float]]:
     """The share of uniform light that each view reflects: ``energy``, and its standard ``error``.
 
-    ``spread``: footprints lie at places up to this far from the view's; 0 means one place.
+    ``spread``: footprints are placed at random, up to this far (UV) from the view's position.
     """
     count = len(views) * samples
     si = View().interaction(count)
@@ -161,10 +162,10 @@ def energy(bsdf: mi.BSDF, views: list[View], samples: int, spread: float) -> lis
 
 
 def mean_of_grid(bsdf: GlintBSDF, count: int) -> list[dict[str, float | str]]:
-    """``mass``: the mean, less one, of the density of ``glint_grid`` over its expectation.
+    """``mass``: the mean of D over its expectation, minus one, for ``glint_grid``.
 
-    The mean is over random places and normals, for footprints of some hundred microdetails, which
-    lie apart.
+    The mean is over random places and normals. The footprints have some hundred microdetails each,
+    and do not overlap.
     """
     pndf = bsdf.pndf
     if not isinstance(pndf, Grid):
@@ -186,15 +187,15 @@ def mean_of_grid(bsdf: GlintBSDF, count: int) -> list[dict[str, float | str]]:
 #  float32 against float64
 # --------------------------------------------------------------------------------------------------
 
-#: Modules that read parameters or belong to Mitsuba's own float32 structures.
+#: Modules that keep single precision: they read parameters, or work on Mitsuba's own structures.
 SINGLE = ("parameters", "normalmap", "bsdf", "registration", "rendering", "cli")
 
 
 class DoubleMitsuba:
     """Mitsuba's names with float64 arrays in place of float32 ones.
 
-    This Mitsuba has no variant in double precision, but its types of arrays exist, and all of the
-    package's mathematics looks them up when it is called.
+    Mitsuba's wheels have no variant in double precision, but the array types exist. The mathematics
+    of this package looks them up when it is called.
     """
 
     def __getattr__(self, name: str) -> Any:
@@ -206,7 +207,7 @@ class DoubleMitsuba:
 
 
 class DoubleDrJit:
-    """Dr.Jit's functions; the bits of a float are those of a float32 all the same."""
+    """Dr.Jit's functions. The bits of a float are still those of a float32."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(dr, name)
@@ -219,7 +220,8 @@ class DoubleDrJit:
 
 @contextmanager
 def double_precision() -> Iterator[DoubleMitsuba]:
-    """Let the package compute in float64; what is loaded in the block must be used in it alone."""
+    """A context in which the package computes in float64. Objects that are loaded in it must not be
+    used outside."""
     double_mitsuba = DoubleMitsuba()
     double = {"mi": double_mitsuba, "dr": DoubleDrJit()}
     single = {"mi": mi, "dr": dr}
@@ -244,7 +246,7 @@ def double_precision() -> Iterator[DoubleMitsuba]:
 class Queries:
     """Directions, normals and footprints in float32 (NumPy, one row per component).
 
-    ``floor``: what values are compared with at least.
+    ``floor``: smallest scale for relative differences of values.
     """
 
     uv: Array
@@ -266,12 +268,12 @@ class Queries:
             value = bsdf.pndf.eval(m.Vector2f(self.m), query, active)
             if bsdf.masking is not None:
                 value = value * bsdf.masking.eval(wi, wo, query, mode, active)
-        # One channel tells all: glints with colours share their density.
+        # One channel is enough: the channels of coloured glints share their density.
         return np.atleast_2d(np.array(value))[0]
 
 
 def queries(bsdf: mi.BSDF, count: int) -> Queries:
-    """Queries at random footprints, of normals that the BSDF draws there."""
+    """Queries with random footprints, for normals that the BSDF draws there."""
     rng = np.random.default_rng(21)
     size, ratio = 10 ** rng.uniform(-4, -0.5, count), 10 ** rng.uniform(0, 4, count)
     angle = rng.uniform(0, 2 * np.pi, count)
@@ -285,8 +287,8 @@ def queries(bsdf: mi.BSDF, count: int) -> Queries:
     u = suite.random_numbers(count, 3, seed=6)
     bs, _ = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
     m = dr.normalize(si.wi + bs.wo)
-    # glint_grid draws from the smooth surface, so D may be next to nothing: only on average is it
-    # the density of what is drawn.
+    # glint_grid draws from the smooth surface, so D may be almost 0 at a sample. Relative
+    # differences are then relative to the smooth density.
     drawn = bs.pdf * 4 * dr.abs(dr.dot(bs.wo, m)) / m.z
     floor = drawn if isinstance(getattr(bsdf, "pndf", None), Grid) else drawn * 0
     valid = np.array(bs.pdf) > 0
@@ -295,35 +297,40 @@ def queries(bsdf: mi.BSDF, count: int) -> Queries:
 
 
 def double_error(bsdf: mi.BSDF, load: Callable[[], mi.BSDF], count: int) -> dict[str, float]:
-    """The same formulas in both precisions: ``error``, the mean of |a − b| / max(|a|, |b|).
+    """The difference of the same formulas in single and in double precision.
 
-    ``load``: makes another ``bsdf``, here in float64.
+    Args:
+        bsdf: the BSDF.
+        load: function that makes the same BSDF again; it is called for double precision.
+        count: number of queries.
 
-    ``last_digit`` is the same error in float64, between normals and places that differ in the last
-    digit of float32: no computation on such numbers can be blamed for it.
+    Returns:
+        ``error``: the mean of |a − b| / max(|a|, |b|). ``last_digit``: the same for two results in
+        float64, for normals and positions that differ in the last digit of float32; no computation
+        can be more accurate than its input.
     """
-    asked = queries(bsdf, count)
-    single = np.float64(asked.value(bsdf, mi))
+    question = queries(bsdf, count)
+    single = np.float64(question.value(bsdf, mi))
     with double_precision() as names:
         bsdf = load()
-        double = asked.value(bsdf, names)
-        m, uv = (np.nextafter(x, np.float32(2)) for x in (asked.m, asked.uv))
-        beside = replace(asked, m=m, uv=uv).value(bsdf, names)
+        double = question.value(bsdf, names)
+        m, uv = (np.nextafter(x, np.float32(2)) for x in (question.m, question.uv))
+        beside = replace(question, m=m, uv=uv).value(bsdf, names)
     del bsdf
-    collect_former_scenes()  # none in float64 may be left for the next rendering
+    collect_former_scenes()  # no BSDF in float64 may exist at the next rendering
     if double.dtype != np.float64:
         raise TypeError(f"computed in {double.dtype}")
 
     def difference(a: Array) -> float:
-        larger = np.maximum(np.maximum(np.abs(a), np.abs(double)), asked.floor)
-        compared = larger != 0  # also where one is not a number
+        larger = np.maximum(np.maximum(np.abs(a), np.abs(double)), question.floor)
+        compared = larger != 0  # true for NaN, too
         return float(np.mean(np.abs(a - double)[compared] / larger[compared]))
 
     return {"error": difference(single), "last_digit": difference(beside)}
 
 
 # --------------------------------------------------------------------------------------------------
-#  A picture
+#  An image
 # --------------------------------------------------------------------------------------------------
 
 #: A power of two, about 10⁶: scaling by it changes no digit.
@@ -331,7 +338,7 @@ BRIGHT = 2.0**20
 
 
 def scene_of_squares(bsdf: mi.BSDF) -> mi.Scene:
-    """Squares with ordinary, inverted and collapsed UVs, in the light of a lamp and a dim sky."""
+    """Squares with ordinary, inverted and collapsed UVs, under a lamp and a dim sky."""
     scene: dict[str, object] = {
         "type": "scene",
         "integrator": {"type": "glint_path", "max_depth": 3},
@@ -372,9 +379,10 @@ def square(x: float, texcoords: list[float], bsdf: mi.BSDF) -> mi.Mesh:
 
 
 def bright_light(bsdf: mi.BSDF) -> dict[str, float]:
-    """A picture in light of 1 and of ``BRIGHT``: ``apart``, their relative L1 difference, scaled.
+    """Two images, with light of radiance 1 and of radiance ``BRIGHT``.
 
-    ``nan`` and ``negative`` count such channels of pixels in the second picture.
+    ``apart`` is their relative L1 difference, after scaling. ``nan`` and ``negative`` count
+    channels of pixels in the second image that are not finite, or negative.
     """
     scene = scene_of_squares(bsdf)
     plain = np.array(mi.render(scene, seed=1), np.float64)
@@ -393,7 +401,8 @@ def bright_light(bsdf: mi.BSDF) -> dict[str, float]:
 
 
 def views(texels: float, quick: bool, large: bool) -> dict[str, View]:
-    """Views for densities of a map ``texels`` wide: from a point to a tenth of it, or to half."""
+    """Views for densities of a map ``texels`` wide: footprints from a point to a tenth of the map,
+    or to half of it if ``large``."""
     texel, slant = 1 / texels, (0.3, 0.1, 1)
     chosen = {
         "texels": View(du=(1.3 * texel, 0.7 * texel), dv=(-0.35 * texel, 0.65 * texel), wi=slant),
@@ -409,7 +418,7 @@ def views(texels: float, quick: bool, large: bool) -> dict[str, View]:
 
 
 def energy_views(texels: float) -> list[View]:
-    """Views for the energy: footprints of half a texel, of four texels and of the map."""
+    """Views for the energy: footprints of half a texel, of four texels, and of the whole map."""
     result = []
     for k, sigma in enumerate((0.5 / texels, 4 / texels, 1.0)):
         for n, inclination in enumerate((0, 60, 85, 89.9)):

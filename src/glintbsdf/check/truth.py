@@ -1,13 +1,13 @@
-"""The truth by brute force: what a scene with a normal map looks like, without any P-NDF.
+"""Reference images by brute force: a scene with a normal map, rendered without any P-NDF.
 
-Mitsuba's own ``normalmap`` around ``roughconductor`` of tiny roughness turns every point of the map
-into a mirror. Pixels average over what they see by sampling alone, so images need thousands of
-samples per pixel, and no footprint, structure or estimator of this package can be at fault.
+Mitsuba's own ``normalmap`` around a ``roughconductor`` of tiny roughness turns every point of the
+map into a mirror. Pixels average by sampling alone, so images need thousands of samples per pixel.
+But they do not depend on any footprint, structure or estimator of this package.
 
-One thing differs from a glint BSDF by definition. A bumped mirror reflects all light that meets it,
-while a microsurface without masking shows its facets by the area they turn to the viewer, as
-``w·m / (m_z w_z)``. Both agree at normal incidence. Elsewhere their means agree with masking, or to
-first order in the slopes where these average to zero.
+By definition, there is one difference from a glint BSDF. A bumped mirror reflects all light that
+arrives, while the facets of a microsurface without masking count by the area that they turn to the
+viewer, as ``w·m / (m_z w_z)``. Both agree at normal incidence. In other directions their means
+agree with masking, or to first order in the slopes if these average to zero.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.maps.normalmap import NormalMap
 
-#: Roughness of the mirrors. In half vectors it is a tenth of the radius of the sun's disk.
+#: Roughness of the mirrors: a tenth of the radius of the sun's half vectors.
 ALPHA = 2e-4
 
 
@@ -33,16 +33,22 @@ def mirrors(
     to_uv: object = None,
     **conductor: object,
 ) -> dict:
-    """The dictionary of stock BSDFs that show a map by brute force; for ``mi.load_dict``.
+    """A dictionary of Mitsuba's own BSDFs for a map, for ``mi.load_dict``.
 
-    Between texel centres a glint BSDF's normals are linear over triangles, a ``bitmap`` texture's
-    bilinear. The map is therefore refined by ``subdivisions``, an odd number so that texel centres
-    stay samples: exact there, and at (``subdivisions`` − 1) points between any two.
+    Between texel centres, the normals of a glint BSDF are linear over triangles, but those of a
+    ``bitmap`` texture are bilinear. So the map is refined. It is then exact at texel centres, and
+    at (``subdivisions`` − 1) points between any two of them.
 
     Args:
+        normal_map: the map.
+        subdivisions: points per texel along each axis, an odd number, so that texel centres are
+            among them.
         alpha: roughness of ``roughconductor``.
         to_uv: transform of the UV coordinates, as for a glint BSDF.
         conductor: further parameters of ``roughconductor``, such as ``material``.
+
+    Raises:
+        ParameterError: ``subdivisions`` is not odd.
     """
     check(
         subdivisions >= 1 and subdivisions % 2 == 1,
@@ -64,7 +70,7 @@ def mirrors(
     return {
         "type": "normalmap",
         "normalmap": texture,
-        # Neither of these is part of the mirrors' geometry.
+        # Both would change the reflection of the mirrors.
         "flip_invalid_normals": False,
         "use_shadowing_function": False,
         "nested": {"type": "roughconductor", "alpha": alpha, **conductor},
@@ -97,7 +103,7 @@ def refined(normal_map: NormalMap, subdivisions: int) -> np.ndarray:
 
 
 def wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
-    """The texel that stands at any whole-numbered index."""
+    """The texel at any index."""
     if wrap_mode == "clamp":
         return np.clip(index, 0, count - 1)
     if wrap_mode == "mirror":
@@ -111,10 +117,10 @@ def slope_moments(
 ) -> np.ndarray:
     """Means, mean squares and mean products of slopes (N, 5: x, y, x², y², xy) of the map's mesh.
 
-    They are weighed by Gaussian footprints: ``uv`` (N, 2) are the places, ``axes`` (N, 2, 2) the
-    axes du, dv in columns, texels. The sums take k² points per texel, k an odd number,
-    out to 4 standard deviations. Where the slope goes from 0 to another value within a texel, as at
-    a scratch, k points find its mean square too small by 1/(4k²): 3 points would be wrong by 3 %.
+    They are weighted by Gaussian footprints, with the centres ``uv`` (N, 2) and the ``axes``
+    (N, 2, 2), whose columns are du and dv in texels. The sums have k² points per texel, with k odd,
+    out to 4 standard deviations. At the edge of a scratch, where the slope grows from 0 within a
+    texel, the mean square of k points is too small by a share of 1/(4k²).
     """
     fine, mode = refined(normal_map, k), normal_map.wrap_mode
     height, width = k * normal_map.height, k * normal_map.width
@@ -122,7 +128,7 @@ def slope_moments(
     for place, axis in zip(uv, axes, strict=True):
         covariance = axis @ axis.T
         extent = np.ceil(4 * np.sqrt(np.diag(covariance))).astype(int)
-        centre = np.asarray(place) * [normal_map.width, normal_map.height]  # in texels' edges
+        centre = np.asarray(place) * [normal_map.width, normal_map.height]  # texels, from the edge
         corner = np.floor(centre).astype(int) - extent
         column, row = (
             np.arange(k * c, k * (c + 2 * e + 1)) for c, e in zip(corner, extent, strict=True)
@@ -131,7 +137,7 @@ def slope_moments(
         inverse = np.linalg.inv(covariance)
         weight = np.exp(-0.5 * np.einsum("...i,ij,...j", offset, inverse, offset))
         if mode == "clamp":
-            # Beyond the border the border's texel goes on, from its centre.
+            # Beyond its border, from the centre of the last texel on, the map is constant.
             row = np.clip(row, k // 2, height - 1 - k // 2)
             column = np.clip(column, k // 2, width - 1 - k // 2)
         taken = fine[np.ix_(wrapped(row, height, mode), wrapped(column, width, mode))]
@@ -145,8 +151,10 @@ def slope_moments(
 class Truth:
     """A reference image and its error.
 
-    ``image`` is H×W×C; ``standard_error``, of the same shape, is one standard deviation of its
-    noise, measured from the spread of independent passes.
+    Attributes:
+        image: the image, H×W×C.
+        standard_error: standard deviation of its noise, of the same shape, from the differences of
+            independent passes.
     """
 
     image: np.ndarray
@@ -158,9 +166,9 @@ class Truth:
         return float(np.sqrt((self.standard_error**2).mean()) / self.image.mean())
 
     def relative_rmse(self, image: np.ndarray) -> float:
-        """Root mean square difference of another image over the mean, without this one's noise.
+        """Root mean square difference of another image, over the mean of this one.
 
-        It is 0 where more noise would be subtracted than there is.
+        The noise of this image is subtracted; the result is 0 if it exceeds the difference.
         """
         squared = ((np.asarray(image, np.float64) - self.image) ** 2).mean()
         squared -= (self.standard_error**2).mean()
@@ -174,14 +182,19 @@ def reference_render(
     seed: int = 0,
     report: Callable[[float], None] = lambda fraction: None,
 ) -> Truth:
-    """Render the first sensor of a scene in independent passes, and tell the error.
+    """Render the first sensor of a scene in independent passes, with the error of the result.
 
-    The scene has :func:`mirrors` for its glint BSDFs, and the samplers and integrator that it
-    wishes; ``spp`` samples per pixel are divided over the ``passes``, at least 2. ``report``
-    is called with the fraction done after each.
+    The standard error includes fireflies, but only those that some sample has found.
 
-    Fireflies of a heavy-tailed estimate show in ``standard_error``, if they are there at all: what
-    no sample has found, no error tells.
+    Args:
+        scene: a scene with :func:`mirrors` in place of glint BSDFs, and any sampler and integrator.
+        spp: samples per pixel of all passes together.
+        passes: number of passes, at least 2.
+        seed: seed of the image.
+        report: called after each pass, with the fraction that is done.
+
+    Raises:
+        ParameterError: ``spp`` is not a multiple of ``passes``.
     """
     check(
         passes >= 2 and spp % passes == 0,

@@ -1,4 +1,4 @@
-"""What ``glintbsdf doctor`` reports: the installation, and how to complete it."""
+"""``glintbsdf doctor``: a report on the installation, and how to complete it."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _PACKAGES = (
     "filelock",
 )
 
-#: Packages that only some users need, and what for.
+#: Packages that only some users need, and the features that need them.
 _OPTIONAL = {"mitsuba-oidn": "render --denoise", "distributed": "--workers and --scheduler"}
 
-# One kernel per variant, in a process of its own: a backend that does not work may abort it.
+# One kernel per variant, in a separate process, as a backend that does not work may abort it.
 _PROBE = """
 import sys
 import glintbsdf, drjit as dr, mitsuba as mi
@@ -43,8 +43,8 @@ for name in sys.argv[1:]:
 class Finding(NamedTuple):
     """One line of the report.
 
-    ``remedy`` is the exact command for what is missing; ``fatal`` says that without it nothing can
-    be rendered.
+    ``remedy`` is the exact command that helps, if something is missing; ``fatal`` says whether
+    nothing can be rendered without it.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Finding(NamedTuple):
 
 
 def examine() -> list[Finding]:
-    """Examine this installation. Takes a few seconds: every JIT variant computes something."""
+    """Examine this installation. This takes a few seconds, as every JIT variant runs a kernel."""
     return [
         Finding("glintbsdf", __version__),
         Finding("Python", f"{platform.python_version()} ({sys.executable})"),
@@ -71,7 +71,8 @@ def examine() -> list[Finding]:
 
 
 def _package(name: str, use: str = "") -> Finding:
-    """Whether a package is there. ``use``: what needs it; empty where everything does."""
+    """Whether a package is installed. ``use`` is the feature that needs it, or empty if it is
+    always needed."""
     try:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
@@ -124,7 +125,7 @@ def _variants() -> Finding:
         probe = subprocess.run(
             [sys.executable, "-c", _PROBE, *names], capture_output=True, text=True, check=False
         )
-        # Those before the first that fails have been printed; a backend mostly runs all or none.
+        # The variants before the first failure were printed; mostly a backend runs all or none.
         running += probe.stdout.split()
         if probe.returncode != 0:
             problem = (probe.stderr.strip() or f"exit status {probe.returncode}").splitlines()[-1]

@@ -1,6 +1,6 @@
 """The command line: ``render``, ``sequence``, ``pndf``, ``inspect``, ``synthesise``, ``doctor``.
 
-Only what concerns the terminal is here; the work is done in other modules.
+This module has only the parts that concern the terminal; other modules do the work.
 """
 
 from __future__ import annotations
@@ -18,8 +18,14 @@ from glintbsdf import __version__
 from glintbsdf.bridge import llvm
 from glintbsdf.check import plot as pndf_plot
 from glintbsdf.cli.doctor import examine
-from glintbsdf.cli.making import Making, Subject, check_image, make, parse_image
-from glintbsdf.cli.making import options as making_options
+from glintbsdf.cli.render_options import (
+    ImageRequest,
+    RenderOptions,
+    check_image,
+    image_option,
+    render_to_file,
+)
+from glintbsdf.cli.render_options import options as render_options
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
@@ -32,9 +38,9 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
 def main() -> NoReturn:
-    """Run the command line. Errors are one line on stderr; ``--debug`` shows where they come from.
+    """Run the command line. Errors are one line on stderr; ``--debug`` shows the traceback.
 
-    Exit status: 0 done, 1 failed, 2 wrong usage.
+    The exit status is 0 for success, 1 for a failure, 2 for wrong usage.
     """
     debug = "--debug" in sys.argv[1:]
     try:
@@ -77,7 +83,7 @@ def commands(debug: bool) -> None:
 
 
 def _activate(variant: str) -> None:
-    """Choose a Mitsuba variant; what prevents it is told before Dr.Jit can abort the process."""
+    """Choose a Mitsuba variant. If it cannot run, raise before Dr.Jit can abort the process."""
     known = [name for name in mi.variants() if not name.startswith("scalar")]
     if variant not in known:
         raise click.BadParameter(
@@ -96,7 +102,7 @@ def _activate(variant: str) -> None:
 def _parse_definitions(
     _context: click.Context, _parameter: click.Parameter, values: Definitions
 ) -> dict[str, str]:
-    """Turn ``("a=1", "b=2")`` into a dictionary of strings."""
+    """A dictionary of strings, from ``("a=1", "b=2")``."""
     pairs = [value.partition("=") for value in values]
     for value, (key, equals, _) in zip(values, pairs, strict=True):
         if not key or not equals:
@@ -105,7 +111,7 @@ def _parse_definitions(
 
 
 def _parse_exr(_context: click.Context, _parameter: click.Parameter, path: Path) -> Path:
-    """Accept only names of OpenEXR files."""
+    """Refuse names that are not names of OpenEXR files."""
     if path.suffix.lower() != ".exr":
         raise click.BadParameter(f'must end in .exr (got "{path}")')
     return path
@@ -123,7 +129,7 @@ _file = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 def _refuse_same(output: Path, given: Path) -> None:
-    """Refuse to write over what is read."""
+    """Refuse to overwrite the input file."""
     if output.exists() and output.samefile(given):
         raise click.BadParameter(f'must not be the map itself (got "{output}")', param_hint="-o")
 
@@ -149,7 +155,7 @@ _sensor_option = click.option(
 
 
 def _image_options(command):
-    """Options of all commands that render images."""
+    """Add the options about the scene and its image that all rendering commands share."""
     for option in reversed(
         [
             _variant_option,
@@ -163,14 +169,14 @@ def _image_options(command):
             click.option(
                 "--denoise",
                 is_flag=True,
-                help="Denoise the indirect light; direct light, and so all glints, stay as they "
-                'are. Needs the integrator "glint_path".',
+                help="Denoise the indirect light. Direct light, and with it all glints, stays as "
+                'it is. Needs the integrator "glint_path".',
             ),
             click.option(
                 "--trim",
                 is_flag=True,
-                help="Build no more of the maps' structures than the scene asks for, which a "
-                "survey with few samples finds out. The image is the same.",
+                help="Build only the parts of the maps' structures that the scene uses, which a "
+                "survey with few samples finds. The image is the same.",
             ),
         ]
     ):
@@ -185,16 +191,10 @@ def _image_options(command):
 
 @commands.command()
 @click.argument("scene", type=_file)
-@click.option(
-    "-o",
-    "output",
-    type=click.Path(path_type=Path),
-    callback=parse_image,
-    help="Image to write, .exr or .png.  [default: SCENE.exr]",
-)
+@image_option("-o", "output", help="Image to write, .exr or .png.  [default: SCENE.exr]")
 @_image_options
 @_define_option("Parameter of the scene; may be repeated.")
-@making_options
+@render_options
 def render(
     scene: Path,
     output: Path | None,
@@ -209,14 +209,14 @@ def render(
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
 
-    The footprint of glint BSDFs that leave "pixel_spread" at 0 is that of the camera's pixels. The
-    same command gives the same image, to the last bit.
+    Glint BSDFs whose "pixel_spread" is 0 get the footprint of the camera's pixels. The same command
+    gives the same image, to the last bit.
     """
-    where = Making(**how)
+    options = RenderOptions(**how)
     _activate(variant)
-    subject = Subject(scene, definitions, variant, spp, seed, denoise, trim, sensor)
-    with where.cluster(variant) as cluster:
-        make(subject, output or scene.with_suffix(".exr"), where, cluster)
+    request = ImageRequest(scene, definitions, variant, spp, seed, denoise, trim, sensor)
+    with options.cluster(variant) as cluster:
+        render_to_file(request, output or scene.with_suffix(".exr"), options, cluster)
 
 
 @commands.command()
@@ -225,27 +225,25 @@ def render(
     "-o",
     "template",
     metavar="NAMES",
-    help="Images to write, .exr or .png; {index} and the names of parameters are filled in.  "
-    "[default: SCENE_{index:04}.exr]",
+    help="Images to write, .exr or .png. Fields such as {index} and {PARAMETER} are replaced by "
+    "the values of a frame.  [default: SCENE_{index:04}.exr]",
 )
 @_image_options
 @_define_option(
-    "Parameter of the scene; may be repeated. first:last:count makes frames of evenly spaced "
-    "values; several such ranges make all combinations."
+    "Parameter of the scene; may be repeated. first:last:count makes a frame for each of count "
+    "evenly spaced values; several such ranges make a frame for each combination."
 )
-@click.option("--table", type=_file, help="CSV file of parameters, a row for each frame.")
-@click.option("--together", is_flag=True, help="Ranges go on together, frame by frame.")
-@click.option(
+@click.option("--table", type=_file, help="CSV file of parameters, with a row for each frame.")
+@click.option("--together", is_flag=True, help="All ranges advance together, frame by frame.")
+@image_option(
     "--sheet",
-    type=click.Path(path_type=Path),
-    callback=parse_image,
-    help="Image to write of all frames side by side; of two ranges, a row for each value of the "
-    "first.",
+    help="Contact sheet of all frames to write, .exr or .png. With two ranges, it has a row for "
+    "each value of the first.",
 )
 @click.option(
     "--video",
     type=click.Path(dir_okay=False, path_type=Path),
-    help="Video to write of all frames, such as out.mp4. Needs ffmpeg.",
+    help="Video of all frames to write, such as out.mp4. Needs ffmpeg.",
 )
 @click.option(
     "--rate",
@@ -254,7 +252,7 @@ def render(
     show_default=True,
     help="Frames of the video per second.",
 )
-@making_options
+@render_options
 def sequence(
     scene: Path,
     template: str | None,
@@ -272,12 +270,12 @@ def sequence(
     trim: bool,
     **how: Any,
 ) -> None:
-    """Render frames of the Mitsuba scene SCENE, which differ in its parameters.
+    """Render frames of the Mitsuba scene SCENE, with different parameters.
 
-    All frames draw the same random numbers. With --checkpoint each frame has a folder of its own in
-    DIR, and frames that are done are not rendered again.
+    All frames draw the same random numbers. With --checkpoint, each frame has its own folder in
+    DIR, and finished frames are not rendered again.
     """
-    where = Making(**how)
+    options = RenderOptions(**how)
     template = template or f"{scene.stem}_{{index:04}}.exr"
     check_image(Path(template))
     rows = frames.read_table(table) if table else []
@@ -288,11 +286,11 @@ def sequence(
     _activate(variant)
     for folder in {name.parent for name in names}:
         folder.mkdir(parents=True, exist_ok=True)
-    with where.cluster(variant) as cluster:
+    with options.cluster(variant) as cluster:
         for index, (values, name) in enumerate(zip(parameters, names, strict=True)):
-            subject = Subject(scene, values, variant, spp, seed, denoise, trim, sensor)
+            request = ImageRequest(scene, values, variant, spp, seed, denoise, trim, sensor)
             label = f"Frame {index + 1} of {len(names)}"
-            make(subject, name, where.of_frame(index), cluster, label)
+            render_to_file(request, name, options.of_frame(index), cluster, label)
     if sheet:
         ranges = [v for v in map(frames.values_of, definitions.values()) if v]
         columns = len(ranges[-1]) if len(ranges) == 2 and not rows and not together else None
@@ -317,10 +315,11 @@ def sequence(
 def inspect(
     scene: Path, variant: str, sensor: str, spp: int | None, definitions: dict[str, str]
 ) -> None:
-    """Report what the glint BSDFs of the Mitsuba scene SCENE are asked for, and what they build.
+    """Report how the Mitsuba scene SCENE uses its glint BSDFs, and what they build.
 
-    The part of each map and the sizes of footprints are what paths of the scene's own sensor and
-    integrator have met, later bounces included; "--trim" is what "render --trim" would build.
+    For each BSDF: the part of its map and the sizes of footprints that paths of the scene's own
+    sensor and integrator use, at all bounces; the memory of its structures; and their memory with
+    "render --trim".
     """
     _activate(variant)
     findings = inspection.inspect(inspection.load(scene, definitions), spp, sensor)
@@ -345,15 +344,7 @@ def inspect(
     show_default=True,
     help="Pixels of a drawing along each axis.",
 )
-@click.option(
-    "-o",
-    "output",
-    type=click.Path(path_type=Path),
-    callback=parse_image,
-    default="pndf.png",
-    show_default=True,
-    help="Drawing to write.",
-)
+@image_option("-o", "output", default="pndf.png", show_default=True, help="Drawing to write.")
 @_variant_option
 @_define_option("Parameter of the BSDF; may be repeated.")
 def pndf(
@@ -368,8 +359,9 @@ def pndf(
 ) -> None:
     """Draw a P-NDF beside its reference.
 
-    Left the plugin's density over the disk of normals, right the same by counting samples; printed
-    are the relative L1 difference, the part of it that is the noise of the reference, and the time.
+    The left half is the plugin's density over the disk of normals, the right half a reference that
+    counts samples. The command prints the relative L1 difference, the difference that noise alone
+    would make, and the time.
     """
     _activate(variant)
     _refuse_same(output, map_file)
@@ -390,15 +382,21 @@ def pndf(
     required=True,
     help="Map to write, .exr.",
 )
-@click.option("--output-size", type=int, default=4096, show_default=True, help="Its texels.")
-@click.option("--patch-size", type=int, default=64, show_default=True, help="Texels of a patch.")
-@click.option("--overlap", type=int, help="Texels patches share; a tenth of a patch's.")
+@click.option(
+    "--output-size", type=int, default=4096, show_default=True, help="Width of the map, texels."
+)
+@click.option(
+    "--patch-size", type=int, default=64, show_default=True, help="Width of a patch, texels."
+)
+@click.option(
+    "--overlap", type=int, help="Overlap of patches, texels.  [default: a tenth of a patch]"
+)
 @click.option(
     "--balance",
     type=float,
     default=0.9,
     show_default=True,
-    help="Weight of normals against their Jacobians.",
+    help="Weight of normals, relative to that of their Jacobians.",
 )
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option(
@@ -406,7 +404,7 @@ def pndf(
     type=click.Choice(WRAP_MODES),
     default="repeat",
     show_default=True,
-    help="To repeat, the map is made to fit to itself.",
+    help="With repeat, the opposite borders of the map fit together.",
 )
 @click.option("--map-type", type=click.Choice(MAP_TYPES), default="auto", show_default=True)
 @click.option("--height-scale", type=float, default=1.0, show_default=True)
@@ -420,7 +418,7 @@ def synthesise(
 ) -> None:
     """Make a large normal map from the small normal or height map SAMPLE.
 
-    It is the map of glint_mip with the same parameters, which does not need it to be stored.
+    The result is the map of glint_mip with the same parameters. That plugin does not need the file.
     """
     _refuse_same(output, sample)
     normal_map = NormalMap.load(sample, map_type, height_scale, wrap_mode, "synthesise")

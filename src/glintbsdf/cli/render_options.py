@@ -1,7 +1,4 @@
-"""How an image is made: where, for how long, and what is kept meanwhile.
-
-These are the options of all commands that render, and the work that they ask for.
-"""
+"""Options of all commands that render images, and the rendering of an image with them."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,7 +23,7 @@ from glintbsdf.scene.storage import Checkpoint
 if TYPE_CHECKING:
     from glintbsdf.scene.cluster import Cluster
 
-#: Seconds between two live pictures.
+#: Seconds from one live image to the next.
 LIVE_INTERVAL = 5.0
 
 _UNITS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -34,8 +31,8 @@ _file = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 
 @dataclass(frozen=True)
-class Making:
-    """What the options of :func:`options` say."""
+class RenderOptions:
+    """Values of the options that :func:`options` adds to a command."""
 
     workers: int | None
     memory_limit: str
@@ -57,15 +54,15 @@ class Making:
         if any(tls) and self.scheduler is None:
             raise click.UsageError("TLS is for --scheduler.")
 
-    def of_frame(self, index: int) -> Making:
-        """The same for a frame of a sequence, with a checkpoint of its own."""
+    def of_frame(self, index: int) -> RenderOptions:
+        """The options for a frame of a sequence, which has its own checkpoint."""
         if self.checkpoint is None:
             return self
         return replace(self, checkpoint=self.checkpoint / f"frame-{index:06}")
 
     @contextmanager
     def cluster(self, variant: str) -> Iterator[Cluster | None]:
-        """The processes that render, or None where it is this one."""
+        """A context with the processes that render; None if this process renders."""
         if self.workers is None and self.scheduler is None:
             yield None
             return
@@ -94,7 +91,7 @@ def _tell(message: str) -> None:
 def _parse_duration(
     _context: click.Context, _parameter: click.Parameter, value: str | None
 ) -> float | None:
-    """Seconds of ``90``, ``90s``, ``15m``, ``2h`` or ``1.5d``."""
+    """Seconds, from a text such as ``90``, ``90s``, ``15m``, ``2h`` or ``1.5d``."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", value.strip())
@@ -106,17 +103,23 @@ def _parse_duration(
 def parse_image(
     _context: click.Context, _parameter: click.Parameter, path: Path | None
 ) -> Path | None:
-    """Accept only names of image files that can be written."""
+    """Refuse names of files whose format cannot be written."""
     if path is not None:
         check_image(path)
     return path
 
 
 def check_image(path: Path) -> None:
-    """Raise ``click.BadParameter`` unless an image file of this name can be written."""
+    """Raise ``click.BadParameter`` unless the suffix is a format that can be written."""
     if path.suffix.lower() not in rendering.FORMATS:
         allowed = " or ".join(rendering.FORMATS)
         raise click.BadParameter(f'must end in {allowed} (got "{path}")')
+
+
+def image_option(*names: str, help: str, **settings: Any):
+    """An option that names an image file to write."""
+    path = click.Path(path_type=Path)
+    return click.option(*names, type=path, callback=parse_image, help=help, **settings)
 
 
 def _parse_memory(_context: click.Context, _parameter: click.Parameter, value: str) -> str:
@@ -126,7 +129,7 @@ def _parse_memory(_context: click.Context, _parameter: click.Parameter, value: s
 
 
 def options(command):
-    """Add the options of :class:`Making` to a command."""
+    """Add the options of :class:`RenderOptions` to a command."""
     for option in reversed(
         [
             click.option(
@@ -142,7 +145,7 @@ def options(command):
                 show_default=True,
                 callback=_parse_memory,
                 metavar="BYTES",
-                help="Of each of these processes, such as 4GB.",
+                help="Memory of each of these processes, such as 4GB.",
             ),
             click.option(
                 "--scheduler",
@@ -150,35 +153,37 @@ def options(command):
                 help="Render on the workers of the Dask scheduler at ADDRESS, such as "
                 "tcp://host:8786.",
             ),
-            click.option("--tls-ca-file", type=_file, help="For a scheduler at tls://."),
+            click.option(
+                "--tls-ca-file",
+                type=_file,
+                help="Certificate of the authority, for a scheduler at tls://.",
+            ),
             click.option("--tls-cert", type=_file, help="The client's certificate."),
             click.option("--tls-key", type=_file, help="The client's private key."),
             click.option(
                 "--checkpoint",
                 type=click.Path(file_okay=False, path_type=Path),
                 metavar="DIR",
-                help="Keep what is done in DIR. The same command goes on from there, whatever "
-                "ended it.",
+                help="Keep finished parts of the image in DIR. After an interruption of any kind, "
+                "the same command continues with these.",
             ),
             click.option(
                 "--until-error",
                 type=click.FloatRange(min=0, min_open=True),
                 metavar="X",
-                help="End when the noise of the image, the standard error of its pixels over their "
-                "mean, is below X.",
+                help="Stop when the noise of the image, the standard error of its pixels over "
+                "their mean, is below X.",
             ),
             click.option(
                 "--time-limit",
                 callback=_parse_duration,
                 metavar="TIME",
-                help="End after TIME, such as 90s, 15m or 2h, with what is done then.",
+                help="Stop after TIME, such as 90s, 15m or 2h, and write the image so far.",
             ),
-            click.option(
+            image_option(
                 "--live",
-                type=click.Path(path_type=Path),
-                callback=parse_image,
                 metavar="FILE",
-                help="Image of what is done so far, .exr or .png, written every five seconds.",
+                help="Write the image so far to FILE, .exr or .png, every five seconds.",
             ),
         ]
     ):
@@ -187,8 +192,8 @@ def options(command):
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What is to be rendered."""
+class ImageRequest:
+    """The image to render."""
 
     scene: Path
     definitions: Mapping[str, str]
@@ -200,10 +205,10 @@ class Subject:
     sensor: str = ""
 
     def refuse_as_output(self, path: Path | None) -> None:
-        """Refuse to write over a file that the scene is made of.
+        """Refuse to overwrite a file of the scene.
 
         Raises:
-            click.ClickException: names the file.
+            click.ClickException: ``path`` is a file of the scene.
         """
         if path is None or not path.exists():
             return
@@ -212,38 +217,42 @@ class Subject:
             raise click.ClickException(f"{path} is a file of the scene: name another with -o")
 
 
-def make(
-    subject: Subject, path: Path, making: Making, cluster: Cluster | None, label: str = "Rendering"
+def render_to_file(
+    request: ImageRequest,
+    path: Path,
+    how: RenderOptions,
+    cluster: Cluster | None,
+    label: str = "Rendering",
 ) -> rendering.Picture:
     """Render an image to a file.
 
     Raises:
-        click.ClickException: Ctrl-C; the file has what was done.
+        click.ClickException: Ctrl-C came; the file has the image so far.
     """
     trimmed = None
-    for output in (path, making.live):
-        subject.refuse_as_output(output)
+    for output in (path, how.live):
+        request.refuse_as_output(output)
     with rendering.replacing(path) as unfinished:
-        # Plugins show the progress of what they build while the scene loads. For a cluster nothing
-        # is built here: the scene then serves to plan and to develop the image.
-        if cluster or subject.trim:
-            inspected = inspection.load(subject.scene, subject.definitions)
+        # While the scene loads, plugins show the progress of their structures. With a cluster,
+        # nothing is built here: the scene only serves to plan and to develop the image.
+        if cluster or request.trim:
+            inspected = inspection.load(request.scene, request.definitions)
             loaded = inspected.scene
             if not cluster:
-                trimmed = inspection.Trimmed(inspected, subject.spp, subject.sensor)
+                trimmed = inspection.Trimmed(inspected, request.spp, request.sensor)
         else:
-            loaded = rendering.load_scene(subject.scene, subject.definitions)
+            loaded = rendering.load_scene(request.scene, request.definitions)
         missed = trimmed.missed if trimmed else lambda: False
-        if not subject.sensor and len(loaded.sensors()) > 1:
+        if not request.sensor and len(loaded.sensors()) > 1:
             sensors = rendering.listed(loaded.sensors())
             _tell(f"of the sensors {sensors} the first is rendered, -s names another")
         with (
             rendering.Renderer(
-                loaded, subject.spp, subject.denoise, missed, subject.sensor
+                loaded, request.spp, request.denoise, missed, request.sensor
             ) as renderer,
             progress(label if cluster is None else f"{label} by {cluster}") as report,
         ):
-            picture, interrupted = _produce(subject, renderer, making, cluster, report)
+            picture, interrupted = _produce(request, renderer, how, cluster, report)
         rendering.save(picture.bitmap, unfinished)
     if trimmed and not trimmed.sufficed:
         _tell("trimmed structures did not suffice: built in full")
@@ -252,33 +261,33 @@ def make(
     if interrupted:
         raise click.ClickException(f"interrupted: {path} has {share}")
     noise = "unknown" if picture.noise is None else f"{picture.noise:.3g}"
-    if picture.fraction < 1 or making.until_error is not None:
+    if picture.fraction < 1 or how.until_error is not None:
         click.echo(f"{share}, noise {noise}", err=True)
     return picture
 
 
 def _produce(
-    subject: Subject,
+    request: ImageRequest,
     renderer: rendering.Renderer,
-    making: Making,
+    how: RenderOptions,
     cluster: Cluster | None,
     report,
 ) -> tuple[rendering.Picture, bool]:
-    """An image, or what was done of it when Ctrl-C came, and whether it came."""
+    """The image, or the finished part of it if Ctrl-C came; and whether it came."""
     checkpoint = render_all = None
-    if cluster or making.checkpoint:
-        package = Package.of(subject.scene, subject.definitions)
+    if cluster or how.checkpoint:
+        package = Package.of(request.scene, request.definitions)
         job = Job(
             package,
-            subject.variant,
+            request.variant,
             renderer.spp,
-            subject.seed,
-            subject.denoise,
-            subject.trim,
-            subject.sensor,
+            request.seed,
+            request.denoise,
+            request.trim,
+            request.sensor,
         )
-        if making.checkpoint:
-            checkpoint = Checkpoint(making.checkpoint, job.description())
+        if how.checkpoint:
+            checkpoint = Checkpoint(how.checkpoint, job.description())
         if cluster:
             render_all = cluster.render_all(job)
     shown = time.monotonic()
@@ -286,19 +295,19 @@ def _produce(
     def observe(image: Image) -> None:
         nonlocal shown
         report(image.fraction)
-        if making.live and time.monotonic() - shown > LIVE_INTERVAL:
-            with rendering.replacing(making.live) as unfinished:
+        if how.live and time.monotonic() - shown > LIVE_INTERVAL:
+            with rendering.replacing(how.live) as unfinished:
                 rendering.save(rendering.picture(renderer, image).bitmap, unfinished)
             shown = time.monotonic()
 
     try:
         picture = rendering.produce(
             renderer,
-            subject.seed,
+            request.seed,
             render_all,
             checkpoint,
-            making.until_error,
-            making.time_limit,
+            how.until_error,
+            how.time_limit,
             observe,
         )
         return picture, False

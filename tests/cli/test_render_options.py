@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from glintbsdf.cli import entry, making
+from glintbsdf.cli import entry, render_options
 from glintbsdf.scene import units
 
 SCENE = """<scene version="3.0.0">
@@ -80,13 +80,13 @@ def test_wrong_options(run, folder, arguments, message):
     "text, seconds", [("90", 90), ("90s", 90), ("15m", 900), ("2h", 7200), ("1.5d", 129600)]
 )
 def test_durations(text, seconds):
-    assert making._parse_duration(None, None, text) == seconds
+    assert render_options._parse_duration(None, None, text) == seconds
 
 
 def test_without_dask(run, folder, monkeypatch):
-    find = making.importlib.util.find_spec
+    find = render_options.importlib.util.find_spec
     monkeypatch.setattr(
-        making.importlib.util,
+        render_options.importlib.util,
         "find_spec",
         lambda name: None if name == "distributed" else find(name),
     )
@@ -139,7 +139,7 @@ def test_checkpoint(run, folder, variant):
 
 
 def test_a_live_picture(run, folder, monkeypatch):
-    monkeypatch.setattr(making, "LIVE_INTERVAL", 0.0)
+    monkeypatch.setattr(render_options, "LIVE_INTERVAL", 0.0)
     assert run("--live", "live.png", "--spp", 64).exit_code == 0
     live = pixels("live.png")
     assert live.shape == (16, 16, 3) and live.mean() > 0
