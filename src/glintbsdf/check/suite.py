@@ -1,11 +1,11 @@
-"""What every glint BSDF must pass, as plain functions: each takes a BSDF and raises on failure.
+"""The test suite for glint BSDFs, as functions: each takes a BSDF and raises if the test fails.
 
-The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as ``glint_path`` does. BSDFs under
-test are made with ``footprint_sigma`` 1, so that a :class:`View` gives standard deviations.
+The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as ``glint_path`` does. The BSDFs must
+have ``footprint_sigma`` 1, so that a :class:`View` gives standard deviations.
 
-A P-NDF is a field of spikes: on the sphere of directions no histogram would resolve it. Densities
-are therefore compared on the disk of projected normals, where ``pdf(wo) 4 |wo·m| / cosθ_m`` is the
-density D, and bins can be as small as the map's normals ask.
+A P-NDF has narrow spikes, which no histogram over the sphere of directions would resolve. So
+densities are compared on the disk of projected normals, where ``pdf(wo) 4 |wo·m| / cosθ_m`` is the
+density D, and bins can be as small as the map's normals require.
 """
 
 from __future__ import annotations
@@ -27,15 +27,19 @@ from glintbsdf.check.reference import binned_pndf
 Pair = tuple[float, float]
 Bounds = tuple[Pair, Pair]
 
-# Significance of one run of all the chi-square tests of a module (Šidák-corrected by test_count).
+# Significance of all χ² tests of a module together; test_count is for Šidák's correction.
 SIGNIFICANCE = 0.01
 
 
 @dataclass(frozen=True)
 class View:
-    """A direction of view and a footprint: its mean and its axes (standard deviations), in UV.
+    """A direction of view and a footprint.
 
-    ``dp_du`` and ``dp_dv``: how UVs lie on the plane.
+    Attributes:
+        uv: centre of the footprint, UV.
+        du, dv: axes of the footprint (standard deviations), UV.
+        wi: direction of view; it need not be normalised.
+        dp_du, dp_dv: derivatives of the position with respect to UV.
     """
 
     uv: Pair = (0.37, 0.61)
@@ -71,7 +75,8 @@ def square(
     lights: dict | None = None,
     spp: int = 16,
 ) -> np.ndarray:
-    """A 24 × 24 picture of a square in the plane z = 0, in one bounce under a constant sky."""
+    """An image of a square in the plane z = 0, 24 × 24 pixels, with one bounce; by default under a
+    constant sky."""
     camera = mi.ScalarTransform4f().look_at([0.3, -1.5, 1.5], [0, 0, 0], [0, 0, 1])
     if from_below:
         camera = mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ camera
@@ -128,7 +133,8 @@ def sample(bsdf: mi.BSDF, view: View, count: int, seed: int = 0) -> tuple:
 
 
 def intensity(spectrum: mi.Spectrum) -> mi.UnpolarizedSpectrum:
-    """A spectrum's channels; of a Mueller matrix the first entry, which acts on intensity."""
+    """The channels of a spectrum. For a Mueller matrix this is its first entry, which acts on the
+    intensity."""
     return spectrum[0, 0] if mi.is_polarized else spectrum
 
 
@@ -145,8 +151,9 @@ def mass_in_bins(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mass of D in each of ``res``² bins over ``bounds``, and the standard error of the quadrature.
 
-    D jumps at the edges of triangles and of the kernel, so the quadrature is by jittered points
-    (``points``² strata per bin), and its error is measured from ``repetitions`` independent runs.
+    D jumps at the edges of triangles and of the kernel. So the quadrature uses jittered points,
+    with ``points``² strata per bin, and its error is measured from ``repetitions`` independent
+    runs.
     """
     lower, upper = np.array(bounds)
     n = res * points
@@ -173,8 +180,8 @@ def p_value(counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray)
     """The p-value of Pearson's χ² test of ``counts`` in bins, out of ``total``, against ``mass``.
 
     ``mass`` is the expected share of each bin. The error of the quadrature (``error``, a standard
-    deviation) adds to the variance of a count. The emptiest bins are taken together until they hold
-    five expected counts.
+    deviation) adds to the variance of a count. The emptiest bins are pooled until their expected
+    count is five.
     """
     order = np.argsort(mass, axis=None)
     counts, expected = counts.ravel()[order], total * mass.ravel()[order]
@@ -195,10 +202,10 @@ def assert_distributed(
     test_count: int,
     bounds: Bounds | None = None,
 ) -> None:
-    """The test of :func:`p_value`, as one of ``test_count``.
+    """Raise AssertionError if :func:`p_value` is too small, for one of ``test_count`` tests.
 
-    The significance of one is :data:`SIGNIFICANCE` after Šidák's correction for them all. A failure
-    names a file with the table of the test, see :func:`dumped`.
+    :data:`SIGNIFICANCE` is the significance of all tests together, by Šidák's correction. The
+    message names a file with the table of the test, see :func:`dumped`.
     """
     p = p_value(counts, total, mass, error)
     significance = 1 - (1 - SIGNIFICANCE) ** (1 / test_count)
@@ -210,20 +217,20 @@ def assert_distributed(
         )
 
 
-#: Environment variable that names the folder for tables of χ² tests that fail; it may not exist.
+#: Environment variable with the folder for tables of failed χ² tests; the folder is created.
 TABLES = "GLINTBSDF_CHI2_TABLES"
 
 
 def dumped(
     counts: np.ndarray, total: int, mass: np.ndarray, error: np.ndarray, bounds: Bounds | None
 ) -> Path:
-    """Write the table of a χ² test, one line per bin, and return the file.
+    """Write the table of a χ² test, with a line for each bin, and return the file.
 
-    The columns: row and column of the bin; the position of its middle on the disk of projected
-    normals, where ``bounds`` are known; observed and expected counts; the standard deviation of
-    their difference, from sampling and from the quadrature; and the difference over it. The file is
-    a CSV in the folder that the environment variable :data:`TABLES` names, else in the system's
-    folder for temporary files.
+    The columns are the row and the column of the bin; its centre on the disk of projected normals,
+    if ``bounds`` are given; the observed and the expected count; the standard deviation of their
+    difference, from sampling and from the quadrature; and their difference over this deviation. The
+    file is a CSV in the folder of the environment variable :data:`TABLES`, or in the system's
+    temporary folder.
     """
     rows, columns = np.indices(np.atleast_2d(counts).shape).reshape(2, -1)
     position = np.full((2, counts.size), np.nan)
@@ -253,11 +260,11 @@ def check_chi2(
     samples: int = 100_000,
     res: int = 25,
 ) -> None:
-    """``sample`` draws from the density that ``pdf`` states, which integrates to one.
+    """``sample`` draws from the density ``pdf``, and this integrates to one.
 
-    ``bounds`` is a rectangle of the disk that holds all normals; the view must be such that nothing
-    is reflected below the horizon. A sample drawn on the very edge of a clamped triangle, which has
-    no neighbour, may be lost to float32 rounding: up to 1e-4 of them may.
+    ``bounds`` is a rectangle of the disk that contains all normals. Nothing may be reflected below
+    the horizon from this view. At most 1e-4 of the samples may be lost: a sample on the edge of a
+    clamped triangle, which has no neighbour, may lie outside of it after float32 rounding.
     """
     si, bs, _ = sample(bsdf, view, samples)
     m = np.array(dr.normalize(si.wi + bs.wo))[:2, np.array(bs.pdf) > 0]
@@ -282,9 +289,9 @@ def check_against_reference(
     seed: int = 1,
     **options,
 ) -> None:
-    """D is the density of :func:`~glintbsdf.reference.binned_pndf` within its statistical error.
+    """D agrees with :func:`~glintbsdf.reference.binned_pndf` within the statistical error.
 
-    ``options`` go to the reference: kernel, epsilon, …
+    ``options`` are arguments of the reference, such as ``kernel`` and ``epsilon``.
     """
     reference = binned_pndf(
         normal_map, view.uv, view.covariance(), res=res, samples=samples, seed=seed, **options
@@ -300,7 +307,7 @@ def check_against_reference(
 
 
 def check_eval_pdf(bsdf: mi.BSDF, view: View, count: int = 2000) -> None:
-    """``eval_pdf`` is ``(eval, pdf)``."""
+    """``eval_pdf`` returns the same as ``eval`` and ``pdf``."""
     si, bs, _ = sample(bsdf, view, count)
     ctx = mi.BSDFContext()
     value, pdf = bsdf.eval_pdf(ctx, si, bs.wo)
@@ -309,11 +316,11 @@ def check_eval_pdf(bsdf: mi.BSDF, view: View, count: int = 2000) -> None:
 
 
 def check_weights(bsdf: mi.BSDF, view: View, count: int = 2000, strays: float = 0.01) -> None:
-    """``weight · pdf = eval`` and the sample's pdf is ``pdf(wo)``.
+    """For samples, ``weight · pdf = eval``, and their pdf is ``pdf(wo)``.
 
-    A half vector recomputed from ``wo`` differs from the normal drawn by float32 rounding, which
-    carries a few samples across the edge of a triangle or of the kernel, where D jumps: a share of
-    ``strays`` may differ.
+    The half vector of ``wo`` differs from the sampled normal by float32 rounding. This carries a
+    few samples across the edge of a triangle or of the kernel, where D jumps. A share of ``strays``
+    may differ for this reason.
     """
     si, bs, weight = sample(bsdf, view, count)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
@@ -327,7 +334,7 @@ def check_weights(bsdf: mi.BSDF, view: View, count: int = 2000, strays: float = 
 
 
 def check_horizon(bsdf: mi.BSDF, view: View, count: int = 500) -> None:
-    """Zero value, pdf and weight wherever the view or the light is at or below the horizon."""
+    """Value, pdf and weight are 0 wherever the view or the light is at or below the horizon."""
     ctx, mirrored, horizontal = mi.BSDFContext(), mi.Vector3f(1, 1, -1), mi.Vector3f(1, 0, 0)
     si, bs, _ = sample(bsdf, view, count)
     up = mi.Vector3f(bs.wo.x, bs.wo.y, dr.abs(bs.wo.z))
@@ -348,7 +355,7 @@ def check_horizon(bsdf: mi.BSDF, view: View, count: int = 500) -> None:
 
 
 def check_finite(bsdf: mi.BSDF, view: View, count: int = 200) -> None:
-    """What is sampled and evaluated is finite and not negative."""
+    """Values, densities, weights and the albedo are finite and not negative."""
     si, bs, weight = sample(bsdf, view, count)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
     u = random_numbers(count, 2, seed=1)
@@ -370,13 +377,12 @@ def check_finite(bsdf: mi.BSDF, view: View, count: int = 200) -> None:
 
 
 def check_adjoint(bsdf: mi.BSDF, view: View, count: int = 500, strays: float = 0.01) -> None:
-    """Light that goes the other way meets the same BSDF: f of importance is f with directions
-    exchanged.
+    """The BSDF for importance is the adjoint of the BSDF for radiance.
 
-    ``f(wi, wo)``, by radiance, is what light from ``wo`` gives ``wi``. Light tracing asks for the
-    adjoint, with ``wi`` towards the light: ``f*(wo, wi) = f(wi, wo)``. A BSDF whose normals lean
-    differently from the surface is not reciprocal, but this holds for every BSDF. A share of
-    ``strays`` may differ: a half vector rounded otherwise, at an edge.
+    ``f(wi, wo)`` transports radiance from ``wo`` to ``wi``. Light tracing uses the adjoint, with
+    ``wi`` towards the light: ``f*(wo, wi) = f(wi, wo)``. This holds for every BSDF, even if it is
+    not reciprocal, as its normals lean differently from the surface. A share of ``strays`` may
+    differ, as half vectors at an edge may be rounded differently.
     """
     si, bs, _ = sample(bsdf, view, count)
     wo = dr.detach(bs.wo)
@@ -394,7 +400,7 @@ def check_adjoint(bsdf: mi.BSDF, view: View, count: int = 500, strays: float = 0
 
 
 def check_furnace(bsdf: mi.BSDF, *views: View, count: int = 20_000) -> None:
-    """Views reflect, on average, no more of uniform light than arrives, but for noise (3 sigma)."""
+    """The views together reflect no more of uniform light than arrives, within noise (3 sigma)."""
     weights = [intensity(sample(bsdf, view, count)[2]) for view in views]
     weight = np.hstack([np.atleast_2d(np.array(w)) for w in weights])
     noise = weight.std(axis=1) / np.sqrt(weight.shape[1])
@@ -529,7 +535,7 @@ def check_render_derivative(
 #  Parameters
 # --------------------------------------------------------------------------------------------------
 
-# Values that no plugin with a map may take, and the parameter that the error names.
+# Values that every plugin with a map must refuse, and the parameter that the error must name.
 NAN = float("nan")
 BAD_PARAMETERS = [
     ({"wrap_mode": "tile"}, "wrap_mode"),
@@ -558,7 +564,7 @@ BAD_PARAMETERS = [
     ({"specular_reflectance": -0.5}, "specular_reflectance"),
     ({"specular_reflectance": NAN}, "specular_reflectance"),
     ({"to_uv": 2.0}, "to_uv"),
-    ({"filename": "map.exr"}, "filename"),  # besides the data of the map
+    ({"filename": "map.exr"}, "filename"),  # the map has data already
     ({"data": (1.0, 2.0, 3.0)}, "data"),
     ({"data": None, "filename": "does_not_exist.exr"}, "filename"),
     ({"data": None, "filename": 3}, "filename"),
@@ -568,7 +574,10 @@ BAD_PARAMETERS = [
 
 
 def check_rejects(good: dict, changes: dict, parameter: str) -> None:
-    """Loading ``good`` with ``changes`` (None: left out) fails and names plugin and parameter."""
+    """Loading ``good`` with ``changes`` fails, and the error names plugin and parameter.
+
+    A change to None removes a parameter.
+    """
     description = {k: v for k, v in {**good, **changes}.items() if v is not None}
     try:
         mi.load_dict(description)
