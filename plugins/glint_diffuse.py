@@ -16,31 +16,30 @@ Diffuse facets of a normal map (:monosp:`glint_diffuse`)
 
  * - method
    - |string|
-   - :monosp:`manifold`: the facets under the footprint, every one of them; or
-     :monosp:`oren_nayar`: Oren and Nayar's model, as rough as the footprint's facets, around their
-     mean normal. It is faster, and blind to what is smaller than a pixel.
-     (Default: :monosp:`manifold`)
+   - :monosp:`manifold`: a sum over all facets under the footprint. :monosp:`oren_nayar`: Oren and
+     Nayar's model around the mean normal of these facets, with their roughness; it is faster, but
+     does not resolve features within a pixel. (Default: :monosp:`manifold`)
 
  * Shared: footprint_sigma, pixel_spread
 
-A diffuse surface with a normal map, free of aliasing. The usual way, :monosp:`diffuse` inside
-:monosp:`normalmap`, looks at one normal of the pixel's footprint per sample. This material
-integrates the light that all facets under the footprint reflect :cite:`Wu24Glint`,
+This BSDF is a diffuse surface with a normal map, without aliasing. The usual way, :monosp:`diffuse`
+inside :monosp:`normalmap`, looks up one normal of the pixel's footprint per sample. This BSDF
+integrates the light that all facets under the footprint reflect :cite:`Wu24Glint`:
 
 .. math::
 
     f_d = \frac{P(\omega)}{\pi\,\omega_z}, \qquad
     P(\omega) = \int D(m) \max(m \cdot \omega, 0)\,\mathrm{d}m,
 
-where :math:`\omega` points to the light and :math:`P`, the projected area of the facets, has a
-closed form for each triangle of the map. It is sampled by the cosine of the surface.
+Here :math:`\omega` points to the light, and :math:`P` is the projected area of the facets, which
+has a closed form for each triangle of the map. Samples follow the cosine to the surface.
 
-A facet counts with its own area, which is larger than the surface's below it; facets neither hide
-nor light each other. For steep maps the surface therefore reflects more than
-:monosp:`reflectance`, by a quarter of the mean squared slope.
+A facet counts with its own area, which is larger than the area of the surface below it. Facets
+neither hide nor light each other. So a steep map reflects more than :monosp:`reflectance`, by a
+quarter of the mean squared slope.
 
-Footprints of up to 4096 texels are summed facet by facet; larger ones are summed over as many
-facets, spread evenly. The cost of a large footprint is bounded, but large.
+For footprints of up to 4096 texels, the sum has all facets. For larger ones it has about as many,
+distributed evenly. So the cost of a large footprint is bounded, but high.
 
 The material is one-sided: use the ``twosided`` adapter for both sides. The shape needs UV
 coordinates.
@@ -153,7 +152,7 @@ class GlintDiffuse(FootprintBSDF):
             return mi.Spectrum(0), mi.Float(0)
         active, wi, wo = above_horizon(active, si.wi, wo)
         query = self.query(si, active)
-        white = wo.z * (1 / pi)  # as long as nothing is built
+        white = wo.z * (1 / pi)  # a plain diffuse surface, before anything is built
         if self.method is not None:
             frame = self.slope_frame(si)
             white = self.method.eval(wi, wo, ctx.mode, query, active, frame)

@@ -11,25 +11,25 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
 
  * - sigma_r
    - |float|
-   - Intrinsic roughness: the standard deviation of a projected normal, in [1e-8, 1]. Glints of
-     flat places of the map are this wide; half vectors in single precision resolve them down to
-     1e-7. (Default: 0.005)
+   - Intrinsic roughness: the standard deviation of a projected normal, in [1e-8, 1]. This is the
+     width of a glint from a flat part of the map. Half vectors in single precision resolve widths
+     down to 1e-7. (Default: 0.005)
    - |exposed|, |differentiable|
 
  * - step
    - |float|
-   - Distance of the elements, in texels: 0.5 for accuracy, 1 for speed. It is rounded so that a
-     whole number of steps makes the map. (Default: 0.5)
+   - Distance of neighbouring elements, in texels: 0.5 for accuracy, 1 for speed. It is rounded so
+     that a whole number of steps makes the map. (Default: 0.5)
 
  * - elements
    - |string|
-   - Whether elements follow the map's curvature, :monosp:`curved`, or have one normal each,
-     :monosp:`flat`, as the facets of a rugged surface. (Default: :monosp:`curved`)
+   - :monosp:`curved`: elements follow the map's Jacobian. :monosp:`flat`: each element has a single
+     normal, like a facet of a rugged surface. (Default: :monosp:`curved`)
 
  * - flake_density
    - |float|
-   - Metallic flakes instead of a map: number of flakes per unit of UV area. They lie at random, no
-     two too close, on the unit UV square, which repeats.
+   - Number of metallic flakes per unit of UV area; they take the place of a map. Flakes are placed
+     by a Poisson-disk pattern on the unit UV square, which repeats.
 
  * - flake_alpha
    - |float|
@@ -39,44 +39,45 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
 
  * - seed
    - |int|
-   - Another number gives other flakes. (Default: 0)
+   - Seed of the flakes. (Default: 0)
 
  * - masking
    - |string|
-   - Masking and shadowing: :monosp:`footprint`, by the elements under the footprint, over the plane
-     of their mean slope, so that no place reflects more light than it receives; :monosp:`beckmann`,
-     the paper's, that of a level Beckmann surface as rough as the whole map or as the flakes, with
-     which a place that leans towards the viewer does; or :monosp:`none`.
-     (Default: :monosp:`footprint`)
+   - Masking and shadowing. :monosp:`footprint`: by the elements under the footprint, relative to
+     the plane of their mean slope, so that no place reflects more light than it receives.
+     :monosp:`beckmann`: the paper's masking, of a level Beckmann surface with the roughness of the
+     whole map, or of all flakes; a place that leans towards the viewer then reflects more than it
+     receives. :monosp:`none`: no masking. (Default: :monosp:`footprint`)
 
  * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
-The glints of a surface whose normals come from a high-resolution map, or from metallic flakes. As
-in :cite:`Yan2016`, the surface is a mixture of *elements*: Gaussians in position ×
-normal space, :monosp:`step` texels apart, each aligned with the normals of the map around it. The
-P-NDF, the distribution of the normals under a pixel's footprint, is then a sum in closed form,
+This BSDF renders the glints of a surface whose normals come from a high-resolution map, or from
+metallic flakes. As in :cite:`Yan2016`, the surface is a mixture of *elements*. These are Gaussians
+in position × normal space, :monosp:`step` texels apart, each aligned with the normals of the map
+around it. The P-NDF, the distribution of the normals under a pixel's footprint, is then a sum in
+closed form:
 
 .. math::
 
     D(m) = \frac{1}{W} \sum_i w_i\, \mathcal{N}(m;\ s_i + J_i \mu_i,\ \sigma_r^2 I + J_i C J_i^T)
 
-where :math:`w_i` is the mass of element :math:`i` under the footprint, :math:`\mu_i` and
-:math:`C` the mean and covariance of the places at which the footprint sees it, and
-:math:`W = \sum_i w_i`. Sampling draws from this density, within 1e-3. Unlike that of
-:ref:`glint_manifold <bsdf-glint_manifold>`, it is smooth: roughness :math:`\sigma_r` is part of it.
+Here :math:`w_i` is the mass of element :math:`i` under the footprint. :math:`\mu_i` and :math:`C`
+are the mean and the covariance of the positions, relative to the element, at which the footprint
+sees it, and :math:`W = \sum_i w_i`. Samples have this density, within 1e-3. It is smooth, unlike
+that of :ref:`glint_manifold <bsdf-glint_manifold>`, as it includes the roughness
+:math:`\sigma_r`.
 
-Elements are not stored, but computed from the texels around them: a map takes 8 bytes per texel,
-and the lists of elements by normal, from which large footprints are evaluated, up to 96, or 42 with
-a :monosp:`step` of 1.
-The moments of the slopes, from which large footprints are masked, take 10. The cost grows with the
-area of the footprint.
+Elements are not stored, but computed from the texels around them. A map takes 8 bytes per texel.
+Large footprints are evaluated from lists of elements by normal, which take up to 96 bytes per
+texel, or 42 with a :monosp:`step` of 1. The moments of slopes that mask large footprints take 10
+bytes. The time of a query grows with the area of the footprint.
 
-The sum is cut where elements weigh little: 3 standard deviations from the footprint's centre, where
-they fade, and 3.94 from the mean of an element's normals. The integral of :math:`D` is one within
-1e-3 for every footprint.
+The sum is cut where elements weigh little: around 3 standard deviations from the footprint's
+centre, where their weight falls to 0, and at 3.94 standard deviations of an element's normals. The
+integral of :math:`D` is one within 1e-3 for every footprint.
 
-Flakes share the whole surface among them: seen from afar they cover it evenly, and a point shows
-the nearest ones. To let a base coat show between them, blend with its material (``blendbsdf``).
+Flakes cover the whole surface. From afar they cover it evenly, and a point shows the nearest ones.
+To show a base coat between flakes, blend with its material (``blendbsdf``).
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

@@ -16,61 +16,62 @@ Smooth filters of a normal map (:monosp:`glint_filtered`)
 
  * - alpha
    - |float|
-   - Roughness of the material itself, > 0; up to 1 for :monosp:`toksvig`. (Default: 0.05)
+   - Base roughness of the material, > 0, and at most 1 for :monosp:`toksvig`. (Default: 0.05)
    - |exposed|, |differentiable|
 
  * - distribution
    - |string|
-   - Shape of the lobe: :monosp:`beckmann`, or for :monosp:`toksvig` and :monosp:`variance` also
+   - Shape of the lobe: :monosp:`beckmann`; :monosp:`toksvig` and :monosp:`variance` also allow
      :monosp:`ggx`. (Default: :monosp:`beckmann`)
 
  * - max_anisotropy
    - |float|
-   - Ratio of a footprint's axes, ≥ 1, beyond which it is widened along the minor axis. The number
-     of lookups along the major axis grows with the ratio; 1 makes all footprints round.
+   - Largest ratio of a footprint's axes, ≥ 1. Longer footprints are widened along their minor axis.
+     The number of lookups along the major axis grows with the ratio; 1 makes all footprints round.
      (Default: 16)
 
  * - masking
    - |string|
-   - Masking and shadowing by the facets of the lobe: :monosp:`footprint`, over the mean facet,
-     LEADR's rule, for all methods; :monosp:`smith`, with the geometric surface in the reflection,
-     so that a footprint which leans towards the viewer reflects more light than it receives; or
-     :monosp:`none`. With :monosp:`leadr`, :monosp:`smith` is :monosp:`footprint`, and there is no
-     :monosp:`none`. (Default: :monosp:`footprint`)
+   - Masking and shadowing by the facets of the lobe. :monosp:`footprint`: LEADR's rule for all
+     methods, relative to the mean facet. :monosp:`smith`: with the cosine of the geometric surface
+     in the BRDF; a footprint that leans towards the viewer then reflects more light than it
+     receives. :monosp:`none`: no masking. With :monosp:`leadr`, :monosp:`smith` is the same as
+     :monosp:`footprint`, and :monosp:`none` is an error. (Default: :monosp:`footprint`)
 
  * - height_correlated
    - |bool|
-   - Whether masking and shadowing are correlated by height, rather than independent.
+   - Whether masking and shadowing are correlated by height; otherwise they are independent.
      (Default: |true|)
 
  * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
-A normal map seen from afar, filtered as games and films do it today: one smooth lobe per footprint.
-Where a pixel covers many thousands of bumps this is all there is to see, at a small part of the
-price of the glints' methods; nearer by it is the baseline that they are measured against. All
-methods average moments of the normals over the whole footprint, however stretched or rotated, from
-a MIP chain that holds no more than the method needs:
+This BSDF filters a normal map to one smooth lobe per footprint, as games and films do today. Where
+a pixel covers many thousands of bumps, there is nothing more to see, and a lobe costs a small part
+of the time of the methods for glints. For smaller footprints it is the baseline for these methods.
+All filters average moments of the normals over the whole footprint, however stretched or rotated it
+is. The averages come from a MIP chain of the moments that the filter needs:
 
 .. list-table::
     :widths: 15 85
 
     * - :monosp:`toksvig`
-      - From the length of the mean normal, isotropic :cite:`Toksvig2005`
+      - An isotropic lobe from the length of the mean normal :cite:`Toksvig2005`
     * - :monosp:`lean`
-      - Mean and covariance of the slopes, an off-centred anisotropic lobe :cite:`Olano2010LEAN`
+      - An off-centre anisotropic lobe from mean and covariance of the slopes
+        :cite:`Olano2010LEAN`
     * - :monosp:`clean`
-      - As LEAN, with one variance for all directions :cite:`Baker2011CLEAN`
+      - As LEAN, with the same variance in all directions :cite:`Baker2011CLEAN`
     * - :monosp:`leadr`
-      - LEAN, with the masking and the projected area of its lobe :cite:`Dupuy2013LEADR`, which
-        here is the default for all of them: never reflects more light than arrives
+      - LEAN, with masking by the projected area of its lobe :cite:`Dupuy2013LEADR`. It never
+        reflects more light than arrives. Here this masking is the default for all filters
     * - :monosp:`variance`
-      - Roughness along u and v per MIP texel, from the variance lost there; what texture filtering
-        between texels loses is not counted :cite:`RTR4`, section 9.13.1
+      - Roughness along u and v, from the variance of slopes within each MIP texel; the variance
+        between texels does not count :cite:`RTR4`, section 9.13.1
 
-The mean normal of a footprint moves the lobe off the geometric normal. Normals are drawn from those
-that the viewer sees. The moments are those of the map under the footprint to 1 % from a standard
-deviation of 1.2 texels on; smaller footprints mix the texels' own moments, as texture filtering
-does, and look rougher than the interpolated normals are.
+The mean normal of a footprint moves the lobe away from the geometric normal. The sampler draws
+visible normals. From a standard deviation of 1.2 texels on, the moments are accurate to 1 %
+(``python -m benchmarks accuracy moments``). Smaller footprints mix the moments of the texels, as
+texture filtering does, and look rougher than the interpolated normals.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

@@ -8,97 +8,99 @@ Procedural glints and grooves (:monosp:`glint_grid`)
 
  * - alpha, or alpha_u and alpha_v
    - |float|
-   - Beckmann roughness of the surface as it looks from afar, along both or each of the axes u and
-     v, at least :monosp:`1e-4`. (Default: 0.3)
+   - Beckmann roughness of the whole surface, as it looks from afar; for both axes, or for u and v,
+     at least :monosp:`1e-4`. (Default: 0.3)
    - |exposed|, |differentiable|
 
  * - detail_alpha, or detail_alpha_u and detail_alpha_v
    - |float|
-   - Roughness of a single microdetail: greater than 0, and at most that of the surface. Where it is
-     equal to the surface's along one axis, microdetails become endless grooves along that axis.
+   - Roughness of a single microdetail: greater than 0, and at most :monosp:`alpha`. If it is equal
+     to :monosp:`alpha` along one axis, microdetails become endless grooves along that axis.
      (Default: 0.05)
    - |exposed|
 
  * - density
    - |float|
-   - Decimal logarithm of the number of microdetails per unit of UV area, from -20 to 20. One of
-     them is as wide as :monosp:`10^(-density/2)` in UV. (Default: 8)
+   - Decimal logarithm of the number of microdetails per unit of UV area, from -20 to 20. A
+     microdetail is about :monosp:`10^(-density/2)` wide in UV. (Default: 8)
    - |exposed|
 
  * - size_variation
    - |float|
-   - Standard deviation, at least 0, of the number of microdetails in equal areas, relative to its
-     mean: some places have many small ones, others a few large. (Default: 0.3)
+   - Standard deviation, at least 0, of the number of microdetails in equal areas, relative to the
+     mean number: some places have many small ones, others a few large ones. (Default: 0.3)
    - |exposed|
 
  * - intensity
    - |float|
-   - Factor on all of the reflection, at least 0. Above 1 the surface may reflect more than it
-     receives. (Default: 1)
+   - Factor on the reflection, at least 0. With a factor above 1 the surface may reflect more light
+     than it receives. (Default: 1)
    - |exposed|, |differentiable|
 
  * - light_spread
    - |float|
-   - Half angle of the cone, in radians from 0 to less than :math:`\pi/2`, that the light fills as
-     seen from the surface. A wide light finds more microdetails that mirror it, so that glints grow
-     weaker and the surface smoother. What the light's shape does to its highlight is the
-     renderer's part. (Default: 0, a point)
+   - Half angle of the cone that the light fills, as seen from the surface, in radians from 0 to
+     less than :math:`\pi/2`. More microdetails reflect a wide light, so glints are weaker and the
+     surface looks smoother. The blur of the highlight by the light's shape is left to the
+     integrator. (Default: 0, a point)
    - |exposed|
 
  * - colors
    - |string| or :monosp:`mitsuba.Bitmap`
-   - Colours of the microdetails: :monosp:`none`; :monosp:`wheel`, all hues, which together make
-     white; or a palette, each pixel of an image being as likely as the others: the name of a file,
-     relative to the scene's folder, or a bitmap. From afar the surface has the palette's mean
-     colour. (Default: :monosp:`none`)
+   - Colours of the microdetails: :monosp:`none`; :monosp:`wheel`, all hues, whose mean is white; or
+     a palette, which is an image whose pixels are equally likely. The image is a file, relative to
+     the scene's folder, or a bitmap. From afar the surface has the palette's mean colour.
+     (Default: :monosp:`none`)
 
  * - max_anisotropy
    - |float|
-   - Largest ratio, at least 1, of the length and width of a pixel on the surface that is resolved;
-     beyond it, at grazing angles, pixels count as wider. Limits the cost. (Default: 16)
+   - Largest ratio, at least 1, of the length and the width of a pixel on the surface. Pixels that
+     are longer, at grazing angles, count as wider than they are. This limits the cost.
+     (Default: 16)
    - |exposed|
 
  * - seed
    - |int|
-   - Another number gives other microdetails. (Default: 0)
+   - Seed of the microdetails. (Default: 0)
 
  * - to_uv
    - |transform|
-   - Transform of the UV coordinates, as for a bitmap texture. The axes of the roughness stay those
-     of the surface: grooves need a transform that does not rotate. (Default: none)
+   - Transform of the UV coordinates, as for a bitmap texture. The axes of the roughness do not turn
+     with it, so grooves need a transform that does not rotate. (Default: none)
    - |exposed|
 
  * - footprint_sigma
    - |float|
-   - Standard deviation of the footprint in pixels; the pixel is taken to be two of them wide.
+   - Standard deviation of the footprint in pixels. A pixel counts as two standard deviations wide.
      (Default: 0.5)
    - |exposed|
 
  * Shared: pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
-Glitter, snow, sand and brushed metal from a few parameters: no map, no memory, no precomputation.
-Microdetails, each a small lobe of roughness :monosp:`detail_alpha`, are strewn over the surface and
-over the directions that they face, so that all together make the Beckmann lobe of roughness
-:monosp:`alpha` :cite:`Zirr16Multiscale`. Where a pixel covers few of them they show as glints, or,
-long along one axis, as grooves; where it covers many, the surface is that of
-:monosp:`roughconductor` with the distribution :monosp:`beckmann`. Their positions belong to the UV
-coordinates, whatever the camera does, and the number that reflects in a pixel is drawn at random,
-but always alike, from hashed numbers of the cells that the pixel covers, on a hierarchy of grids:
+This BSDF renders glitter, snow, sand and brushed metal from a few parameters, without a map, memory
+or precomputation. The surface is covered with microdetails, each of which is a small lobe of
+roughness :monosp:`detail_alpha`. The directions that they face are random. All together they make
+the Beckmann lobe of roughness :monosp:`alpha` :cite:`Zirr16Multiscale`. Where a pixel covers a few
+microdetails, they are visible as glints, or as grooves if they are long along one axis. Where a
+pixel covers many, the surface looks like :monosp:`roughconductor` with the distribution
+:monosp:`beckmann`. Microdetails are fixed in UV space, wherever the camera is. The number of
+microdetails that reflect in a pixel is random but repeatable: it comes from hashes of the cells
+that the pixel covers, on a hierarchy of grids.
 
 .. math::
 
     D(m) = D_g(m) \sum_C w_C \frac{n_C}{N_C P(m)}, \qquad
     n_C \sim B(N_C, P(m)), \qquad P(m) = \frac{D_g(m)}{D_l(0)}
 
-with weights :math:`w_C` of the cells that add up to one, :math:`N_C` microdetails in a cell, of
-which :math:`n_C` reflect. On average over places :math:`D = D_g` exactly. A single place is *not*
-normalised: too many microdetails in one direction are not made up for in others, and it may reflect
-more than it receives. Sampling draws from the visible normals of the smooth surface; the weight of
-a sample holds the glints.
+Here :math:`w_C` are weights of the cells, which add up to one. A cell has :math:`N_C` microdetails,
+of which :math:`n_C` reflect. The mean of :math:`D` over all places is exactly :math:`D_g`. A single
+place is *not* normalised: a surplus of microdetails in one direction is not compensated in others,
+so the place may reflect more light than it receives. The sampler draws visible normals of the
+smooth surface, and the glints are in the weight of a sample.
 
-Stretched UV coordinates stretch microdetails, and what is finer than four spacings of float32 UV
-coordinates is not resolved. Derivatives with respect to roughness are those of the smooth surface
-times the glints, which stay; they are exact on average.
+Stretched UV coordinates stretch microdetails. Microdetails finer than four spacings of float32 UV
+coordinates are not resolved. Derivatives with respect to the roughness keep the glints as they are,
+and differentiate the smooth surface; they are exact on average.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
@@ -177,7 +179,7 @@ class GlintGrid(GlintBSDF):
             "seed": parameters.whole("seed", 0),
             "owner": self.owner,
         }
-        # Nothing is stored: there is nothing to wait for.
+        # There is no structure that would have to be deferred.
         self.build()
 
     def create(self, domain: Domain | None) -> Grid:

@@ -11,95 +11,95 @@ Glints of a normal map, exact (:monosp:`glint_manifold`)
 
  * - kernel
    - |string|
-   - Weight of the map's points under the footprint with standard deviation σ: :monosp:`gaussian`,
-     cut at 3σ; :monosp:`disk`, uniform within 1.5σ; :monosp:`box`, uniform within ±1.5σ along u and
-     v. (Default: :monosp:`gaussian`)
+   - Kernel that weights the points of the map under a footprint of standard deviation σ:
+     :monosp:`gaussian`, cut at 3σ; :monosp:`disk`, uniform within 1.5σ; :monosp:`box`, uniform
+     within ±1.5σ along u and v. (Default: :monosp:`gaussian`)
 
  * - epsilon
    - |float|
-   - Smallest Jacobian determinant of a triangle of the manifold, in (0, 1): a flat part of the map
-     becomes a highlight of this area on the disk of projected normals. (Default: 1e-6)
+   - Smallest Jacobian determinant of a triangle of the manifold, in (0, 1). A flat part of the map
+     becomes a highlight of about this area on the disk of projected normals. (Default: 1e-6)
 
  * - threshold
    - |float|
-   - The threshold τ of the paper's hierarchy of clusters: a cluster of triangles takes the place of
-     those of the map where the integral of its squared error, as a distance in texels, is at most
-     τ times the footprint's radii :math:`r_x r_y`. Between 1e-4 and 1e-2, say; with 0, evaluation
-     is exact. (Default: 0)
+   - Threshold τ of the paper's hierarchy of clusters. A cluster replaces its triangles where the
+     integral of its squared error, a distance in texels, is at most τ times the product
+     :math:`r_x r_y` of the footprint's radii. Useful values are 1e-4 to 1e-2. With 0, evaluation is
+     exact. (Default: 0)
 
  * - max_error
    - |float|
-   - Relative L1 error of the P-NDF allowed, over the bins of the tables, 1/128 of the range of the
-     map's normals, at least 1e-4; 0.05, say. Within a bin normals are spread evenly: finer bins, or
-     bins that lie otherwise, differ by more where many facets have nearly the same normal, as
-     flakes have. Footprints large enough for it are evaluated from tables of the normals around the
-     nodes of a lattice, whose distance grows with the footprint, at a cost that does not; small
-     ones exactly. The error is predicted from the footprint and from errors measured on the map,
-     for the kernel in use, when the tables are built. Over six kinds of maps and footprints from 11
-     to 171 texels of standard deviation, the true one, averaged over three places, is 0.63 to 0.96
-     of it (:monosp:`disk`: 0.56 to 0.95, :monosp:`box`: 0.45 to 0.91), and up to 1.2 at a single
-     place. On a map of 1024², with 0.05, tables serve Gaussian footprints from 7 to 16 texels on,
-     those of kernels with an edge later. Each level of the tables takes up to 62 MiB, all with the
-     lists for small footprints up to 190 MiB. From exact to tabulated there is no transition but a
-     change by less than this error. Sampling stays exact. With the :monosp:`wrap_mode`
-     :monosp:`clamp`, and with 0, evaluation is exact at all sizes. Excludes :monosp:`threshold`.
+   - Largest relative L1 error of the P-NDF; a useful value is 0.05. Large footprints are then
+     evaluated from tables of normals around the nodes of a lattice, at a cost that does not grow
+     with the footprint. Small footprints are evaluated exactly. The error is that of the masses in
+     the bins of the tables, which are 1/128 of the range of the map's normals wide, and at least
+     1e-4. Within a bin D is constant, so finer or shifted bins have a larger error where many
+     facets have almost the same normal, as in maps of flakes. The error is predicted from the
+     footprint, and from errors that are measured on the map when the tables are built;
+     ``python -m benchmarks manifold tables`` compares it with the true error. Each level of the
+     tables takes up to 62 MiB; all levels, with the lists for small footprints, take up to 190 MiB.
+     There is no blending: where a growing footprint changes to tables, or to the next level, D
+     jumps by less than this error. Samples have exactly the density D. With :monosp:`wrap_mode`
+     :monosp:`clamp`, and with 0, evaluation is exact at all sizes. It excludes :monosp:`threshold`.
      (Default: 0)
 
  * - hand_over
    - |float|
-   - Size of the footprint (geometric mean of its standard deviations), in texels, from which the
-     P-NDF gives way to LEAN's smooth lobe, which is all that is left at twice the size; 0 for
-     never. Under the sun, a map of Gaussian bumps 6 texels wide differs from the lobe by 8 % at 64
-     texels and 4 % at 128; maps of scratches or flakes differ from a smooth lobe still at 256. The
-     lobe of a map as steep as slopes of 200 reflects more light than arrives at grazing angles.
-     (Default: 0)
+   - Size of the footprint (geometric mean of its standard deviations), in texels, from which on
+     LEAN's smooth lobe replaces the P-NDF; 0 for never. From this size to twice the size, D is a
+     mixture of both. Under the sun, a map of Gaussian bumps 6 texels wide differs from the lobe by
+     8 % at 64 texels and 4 % at 128; maps of scratches or flakes still differ from a smooth lobe at
+     256 texels (``python -m benchmarks accuracy hand_over``). At grazing angles, the lobe of a very
+     steep map (slopes of 200) reflects more light than arrives. (Default: 0)
 
  * - masking
    - |string|
-   - Masking and shadowing by the projected area of the facets under the footprint, over the plane
-     of their mean slope, so that no place reflects more light than it receives: :monosp:`ggx_fit`,
-     that of the smooth surface with the facets' mean and variance of slopes; :monosp:`analytic`,
-     their own, exact but many times slower, as every triangle under the footprint counts. Or
-     :monosp:`beckmann`, that of a level Beckmann surface as rough as the whole map, with which a
-     place that leans towards the viewer reflects more than it receives, or :monosp:`none`.
-     (Default: :monosp:`ggx_fit`)
+   - Masking and shadowing. :monosp:`ggx_fit` and :monosp:`analytic` use the projected area of the
+     facets under the footprint, relative to the plane of their mean slope, so that no place
+     reflects more light than it receives. :monosp:`ggx_fit` takes the projected area of a smooth
+     surface with the same mean and covariance of slopes. :monosp:`analytic` sums over the
+     triangles, which is exact but many times slower. :monosp:`beckmann` is the masking of a level
+     Beckmann surface with the roughness of the whole map; a place that leans towards the viewer
+     then reflects more than it receives. :monosp:`none`: no masking. (Default: :monosp:`ggx_fit`)
 
  * - height_correlated
    - |bool|
-   - Whether masking and shadowing are correlated by height, rather than independent.
+   - Whether masking and shadowing are correlated by height; otherwise they are independent.
      (Default: |true|)
 
  * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
-The glints of a surface whose normals come from a high-resolution map. Every pixel sees a patch of
-the map, its *footprint*; the distribution of the normals in it, the P-NDF, takes the place of the
-smooth normal distribution of a microfacet BRDF. As in :cite:`Wu24Glint`, the map is a mesh of
-triangles in position × normal space, on which the P-NDF has a closed form, evaluated exactly:
+This BSDF renders the glints of a surface whose normals come from a high-resolution map. Every pixel
+sees a part of the map, its *footprint*. The distribution of the normals in the footprint, the
+P-NDF, replaces the smooth normal distribution of a microfacet BRDF. As in :cite:`Wu24Glint`, the
+map is a mesh of triangles in position × normal space. On this mesh the P-NDF has a closed form,
+which is evaluated exactly:
 
 .. math::
 
     D(m) = \sum_{\Delta:\, m \in n(\Delta)} \frac{k(u^* - x)}{|\det J_\Delta|}
 
-where :math:`u^*` is the place in triangle :math:`\Delta` whose normal is :math:`m`, :math:`k` the
-kernel around the footprint's centre :math:`x`, and :math:`J_\Delta` the Jacobian of the normals
-over the triangle. Sampling draws from exactly this density.
+Here :math:`u^*` is the position in triangle :math:`\Delta` whose normal is :math:`m`, :math:`k` is
+the kernel around the footprint's centre :math:`x`, and :math:`J_\Delta` is the Jacobian of the
+normals over the triangle. Samples have exactly this density.
 
-The paper masks facets over the geometric surface. A footprint leans, though, and a plane hides
-nothing of itself. Here :math:`1 + \Lambda(\omega) = \max(P(\omega)/\bar P(\omega), 1)`, with
-:math:`P` the projected area of the facets and :math:`\bar P` that of their mean plane, which also
-takes the place of the cosine of the view in :math:`F D G / (4 \bar P(\omega_i))`, as in
-:cite:`Dupuy2013LEADR`. Other plugins with a map do the same. On a surface of slopes 0.15, at 0°,
-46° and 69°, places under footprints of some texels reflect on average what a ray traced height
-field does, within 2 %; at 83°, where it reflects 0.93, the rule gives 0.80 to 0.90.
+The paper masks facets relative to the geometric surface. But the facets under a footprint lean
+together, and a plane does not hide itself. So here
+:math:`1 + \Lambda(\omega) = \max(P(\omega)/\bar P(\omega), 1)`, where :math:`P` is the projected
+area of the facets, and :math:`\bar P` the projected area of their mean plane. It also replaces the
+cosine of the view in :math:`F D G / (4 \bar P(\omega_i))`, as in :cite:`Dupuy2013LEADR`. The other
+plugins with a map do the same. ``python -m benchmarks energy`` compares the reflected energy with
+ray tracing of the displaced surface. Both agree within 2 % up to an angle of 69°; near the horizon
+the BSDF reflects less.
 
-*Derivatives with respect to* :monosp:`data`. This density, at a fixed :math:`m`, jumps whenever an
-edge of a triangle moves across :math:`m`: automatic differentiation would see the change within
-triangles, but not the jumps, and be wrong by a factor or by sign. As long as derivatives of
-:monosp:`data` are asked for (``dr.enable_grad``, then ``params.update()``), the mixture of elements
-of :ref:`glint_elements <bsdf-glint_elements>` therefore stands in, half a texel apart and with a
-tenth of the roughness of the map's normals, at least 0.001, whatever :monosp:`threshold` and
-:monosp:`max_error` say. Images are then smoother by this much, and their derivatives right: under a
-smooth light 0.7 times as wide as the map's normals, within 1 % of the truth.
+*Derivatives with respect to* :monosp:`data`. At a fixed :math:`m`, this density jumps whenever an
+edge of a triangle moves across :math:`m`. Automatic differentiation would see the changes within
+triangles, but not the jumps, and even the sign could be wrong. So while :monosp:`data` carry
+derivatives (``dr.enable_grad``, then ``params.update()``), a mixture of elements as in
+:ref:`glint_elements <bsdf-glint_elements>` replaces the manifold. Its elements are half a texel
+apart, and its roughness is a tenth of the standard deviation of the map's normals, at least 0.001.
+:monosp:`threshold` and :monosp:`max_error` then have no effect. Images are a little smoother, and
+their derivatives are correct.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
