@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import shutil
@@ -335,6 +336,12 @@ def test_a_local_cluster_listens_on_loopback_only(two):
 # ---------------------------------------------------------------------------------------------
 
 
+def listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+        return True
+    return False
+
+
 class Scheduler:
     """``dask scheduler`` and a ``dask worker``, as a user starts them."""
 
@@ -355,6 +362,10 @@ class Scheduler:
             ),
             self.start(folder, worker_path, "worker", self.address, "--no-dashboard", *common),
         ]
+        # A user waits for the scheduler's address before he gives it to a command.
+        while not listens(int(port)):
+            assert self.processes[0].poll() is None
+            time.sleep(0.2)
 
     @staticmethod
     def start(folder: Path, path: Path | None, *arguments: str) -> subprocess.Popen:

@@ -505,6 +505,9 @@ class _Rendering:
 
     def received(self, future: Future) -> tuple[Unit, Tile, np.ndarray] | None:
         """Handle the end of a task. Returns a unit that is done, or None if there is more to do."""
+        if future.status in ("pending", "lost"):
+            # The worker died before its result was fetched. Dask gives the task to another one.
+            return None
         task = self.pending.pop(future)
         if future.status == "error":
             self.failed(task, future.exception())
