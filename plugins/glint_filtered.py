@@ -15,8 +15,9 @@ Smooth filters of a normal map (:monosp:`glint_filtered`)
      :monosp:`variance`, see below. (Default: :monosp:`lean`)
 
  * - alpha
-   - |float|
-   - Base roughness of the material, > 0, and at most 1 for :monosp:`toksvig`. (Default: 0.05)
+   - |float| or |texture|
+   - Base roughness of the material, > 0, and at most 1 for :monosp:`toksvig`. Values of a texture
+     are clipped to [0.0001, 10]. (Default: 0.05)
    - |exposed|, |differentiable|
 
  * - distribution
@@ -121,9 +122,12 @@ class GlintFiltered(GlintBSDF):
         parameters = Parameters(props)
         method = parameters.choice("method", "lean", tuple(METHODS))
         self.normal_map = parameters.normal_map()
+        alpha = parameters.number_or_texture("alpha", 0.05)
+        if isinstance(alpha, mi.Texture):
+            self.textures, alpha = {"alpha": alpha}, None
         self.options = {
             "method": method,
-            "alpha": parameters.number("alpha", 0.05),
+            "alpha": alpha,
             "distribution": parameters.choice("distribution", "beckmann", DISTRIBUTIONS),
             "max_anisotropy": parameters.number("max_anisotropy", 16.0),
             "owner": self.owner,

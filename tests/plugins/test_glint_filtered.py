@@ -243,6 +243,7 @@ BAD_OWN_PARAMETERS = [
     ({"method": "leadr", "distribution": "ggx"}, "distribution"),
     ({"alpha": 0.0}, "alpha"),
     ({"alpha": -0.1}, "alpha"),
+    ({"alpha": "rough"}, "alpha"),
     ({"alpha": suite.NAN}, "alpha"),
     ({"method": "toksvig", "alpha": 1.5}, "alpha"),
     ({"max_anisotropy": 0.5}, "max_anisotropy"),
@@ -286,6 +287,54 @@ def test_changed_parameters_take_effect(variant):
     params["alpha"] = -1.0
     with pytest.raises(ValueError, match='glint_filtered: "alpha" must be'):
         params.update()
+
+
+@pytest.mark.parametrize("method", ["lean", "toksvig"])
+def test_alpha_from_a_texture(variant, method):
+    """At every place the lobe of the texture's value there, clipped to what is allowed."""
+    values = np.array([[0.05, 0.4], [1e-9, 50.0]], np.float32)
+    most = 1.0 if method == "toksvig" else 10.0
+    texture = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(values[..., None]),
+        "raw": True,
+        "filter_type": "nearest",
+    }
+    bsdf = load(method=method, alpha=texture, material="Au")
+    for row, column in np.ndindex(values.shape):
+        alpha = min(max(float(values[row, column]), 1e-4), most)
+        view = replace(RESOLVED, uv=(0.25 + 0.5 * column, 0.25 + 0.5 * row))
+        plain = load(method=method, alpha=alpha, material="Au")
+        si, bs, weight = suite.sample(bsdf, view, 200)
+        _, bs_plain, weight_plain = suite.sample(plain, view, 200)
+        assert dr.allclose(bs.wo, bs_plain.wo, atol=1e-6) and dr.allclose(weight, weight_plain)
+        for of, expected in zip(
+            bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo),
+            plain.eval_pdf(mi.BSDFContext(), si, bs.wo),
+            strict=True,
+        ):
+            assert dr.allclose(of, expected)
+    assert "alpha=textured" in str(bsdf)
+
+
+def test_derivative_by_the_texels_of_alpha(variant):
+    """The sum over the texels of a texture is the derivative by one number in their place."""
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((4, 4, 1), 0.2, np.float32))}
+    derivatives = []
+    for alpha, key in ((0.2, "alpha"), ({**texture, "raw": True}, "alpha.data")):
+        bsdf = load(alpha=alpha)
+        si, bs, _ = suite.sample(bsdf, RESOLVED, 100)
+        wo = dr.detach(bs.wo)
+        params = mi.traverse(bsdf)
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.sum(bsdf.eval(mi.BSDFContext(), si, wo)[0]))
+        derivatives.append(
+            dr.sum(dr.grad(params[key]), axis=None).array[0]
+            if key != "alpha"
+            else dr.grad(params[key])[0]
+        )
+    assert np.isclose(*derivatives, rtol=1e-3) and derivatives[0] != 0
 
 
 def test_only_the_moments_of_the_method_are_kept(variant):

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 from weakref import WeakSet
 
 import drjit as dr
@@ -88,6 +89,9 @@ class FootprintBSDF(mi.BSDF):
     #: Whether it averages over what an interaction carries, see :class:`~.Carried`.
     integrates_lights = False
 
+    #: Parameters of the P-NDF that a texture gives at every surface point.
+    textures: Mapping[str, mi.Texture] = {}
+
     normal_map: NormalMap | None = None
     watch: Recorder | Gate | None = None
 
@@ -122,6 +126,8 @@ class FootprintBSDF(mi.BSDF):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         flags = mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous
+        for name, texture in self.textures.items():
+            callback.put(name, texture, flags)
         callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
         callback.put("footprint_sigma", self.footprint_sigma, flags)
         callback.put("pixel_spread", self.pixel_spread, flags)
@@ -210,14 +216,23 @@ class FootprintBSDF(mi.BSDF):
         the query.
         """
         self.traverse(RefusesDerivatives(self.owner))
-        footprint = self.footprint(si, active)
+        footprint, parameters = self.footprint(si, active), self.parameters_at(si, mi.Bool(active))
         carried = Carried.of(si) if self.integrates_lights and wo is not None else None
         if carried is None:
-            return Query(footprint)
+            return Query(footprint, parameters=parameters)
         # Per UV of the map: H times the inverse of the linear part of to_uv.
         to_uv = mi.AffineTransform3f(self.to_uv).matrix
         inverse = dr.rcp(mi.Matrix2f([[to_uv[0, 0], to_uv[0, 1]], [to_uv[1, 0], to_uv[1, 1]]]))
-        return Query(footprint, carried.turn(si) @ inverse, carried.spread(wi, wo))
+        return Query(footprint, carried.turn(si) @ inverse, carried.spread(wi, wo), parameters)
+
+    def parameters_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Mapping[str, mi.Float]:
+        """The values of :attr:`textures` at ``si``, by name, clipped to the parameter's range."""
+        values = {}
+        for name, texture in self.textures.items():
+            allowed = declared_range(self.owner, name)
+            value = texture.eval_1(si, active)
+            values[name] = dr.clip(value, allowed.minimum, allowed.maximum)
+        return values
 
     def warn_of_point_footprint(self) -> None:
         """Say, once, that nothing tells how large a pixel is, and why."""
@@ -257,6 +272,20 @@ class FootprintBSDF(mi.BSDF):
             if value is not None
         ]
         return f"{type(self).__name__}[\n" + ",\n".join(lines) + "\n]"
+
+
+class Facets(NamedTuple):
+    """What reflects at a surface interaction.
+
+    Attributes:
+        pndf (PNDF): the distribution of their normals.
+        masking (SmithMasking): how they hide each other; None for not at all.
+        tint (mi.UnpolarizedSpectrum): factor on what they reflect.
+    """
+
+    pndf: PNDF
+    masking: SmithMasking | None
+    tint: mi.UnpolarizedSpectrum
 
 
 class GlintBSDF(FootprintBSDF):
@@ -355,18 +384,18 @@ class GlintBSDF(FootprintBSDF):
     #  Mitsuba's interface
     # ----------------------------------------------------------------------------------------------
 
-    def facets(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f
-    ) -> tuple[PNDF, SmithMasking | None]:
-        """The facets that reflect at ``si``, and their masking: the glints, or their smooth
-        counterpart where ``ctx`` asks for it."""
-        pndf, masking = self.pndf, self.masking
-        if pndf is None or (self.smooth is not None and asks_for_smooth_lobes(ctx)):
-            pndf, masking = self.smooth, self.smooth_masking
+    def facets(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Facets:
+        """The facets that reflect at ``si``: the glints, or their smooth counterpart where ``ctx``
+        asks for it."""
+        if self.pndf is None or (self.smooth is not None and asks_for_smooth_lobes(ctx)):
+            facets = Facets(self.smooth, self.smooth_masking, self.mean_tint(si, active))
+        else:
+            facets = Facets(self.pndf, self.masking, self.tint(si, active))
         frame = self.slope_frame(si)
         if frame is None:
-            return pndf, masking
-        return Displaced(pndf, frame), masking and DisplacedMasking(masking, frame)
+            return facets
+        masking = facets.masking and DisplacedMasking(facets.masking, frame)
+        return Facets(Displaced(facets.pndf, frame), masking, facets.tint)
 
     def components(self, ctx: mi.BSDFContext) -> list[tuple[int, Component]]:
         """The components that ``ctx`` asks for, with their indices."""
@@ -384,36 +413,59 @@ class GlintBSDF(FootprintBSDF):
         sample2: mi.Point2f,
         active: bool | mi.Bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        bs = dr.zeros(mi.BSDFSample3f)
+        bs, weight = dr.zeros(mi.BSDFSample3f), mi.Spectrum(0)
         components = self.components(ctx)
-        if not components:
-            return bs, mi.Spectrum(0)
-        ((index, component),) = components
+        # All components are as likely as each other. One alone takes every sample, as it is.
+        share = 1 / max(1, len(components))
+        for count, (index, component) in enumerate(components):
+            chosen, number = mi.Bool(active), sample1
+            if share < 1:
+                chosen &= (sample1 >= count * share) & (sample1 < (count + 1) * share)
+                number = dr.clip((sample1 - count * share) * len(components), 0, 1 - 2**-24)
+            sampled = self.sample_component(component, ctx, si, number, sample2, chosen)
+            sampled[0].sampled_component = index
+            if share < 1:
+                sampled[0].pdf *= share
+                sampled = (
+                    dr.select(chosen, sampled[0], bs),
+                    dr.select(chosen, sampled[1] * (1 / share), weight),
+                )
+            bs, weight = sampled
+        return bs, weight
+
+    def sample_component(
+        self,
+        component: Component,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        """``sample`` of one component."""
+        bs = dr.zeros(mi.BSDFSample3f)
         active, wi = component.above_horizon(active, si.wi)
 
         # Draw a normal and scatter at it. One that does not point up, or scatters to the wrong side
         # of the surface, is an invalid sample: its mass is missing from the pdf as well.
         query = self.query(si, active)
-        pndf, masking = self.facets(ctx, si)
+        facets = self.facets(ctx, si, active)
         # The sample stays where it is: the derivatives of an estimate are those of its weight.
-        m = dr.detach(pndf.sample_visible(wi, query, sample1, sample2, active))
+        m = dr.detach(facets.pndf.sample_visible(wi, query, sample1, sample2, active))
         wo, active = component.scattered(wi, m, active)
-        density = self.density(pndf, m, query, si, active)
-        pdf = pndf.visible_pdf(wi, m, density, query, active)
+        density = self.density(facets.pndf, m, query, si, active)
+        pdf = facets.pndf.visible_pdf(wi, m, density, query, active)
         active &= pdf > 0
 
         bs.wo = wo
         bs.pdf = dr.select(active, component.density_of_direction(pdf, wo, m), 0)
         bs.eta = component.eta
         bs.sampled_type = mi.UInt32(+component.flags)
-        bs.sampled_component = index
 
         value = component.value(density, wi.z)
         drawn = dr.detach(component.density_of_direction(pdf, wo, m))
         weight = value / dr.select(active, drawn, 1)
-        return bs, self.scattered(
-            weight, component, pndf, masking, ctx, si, wi, wo, m, query, active
-        )
+        return bs, self.scattered(weight, component, facets, ctx, si, wi, wo, m, query, active)
 
     def eval_pdf(
         self,
@@ -423,12 +475,13 @@ class GlintBSDF(FootprintBSDF):
         active: bool | mi.Bool = True,
     ) -> tuple[mi.Spectrum, mi.Float]:
         value, pdf = mi.Spectrum(0), mi.Float(0)
-        for count, (_, component) in enumerate(self.components(ctx)):
-            of_component = self.eval_pdf_component(component, ctx, si, wo, active)
+        components = self.components(ctx)
+        for count, (_, component) in enumerate(components):
+            of_component = self.eval_pdf_component(component, ctx, si, wo, mi.Bool(active))
             value, pdf = (
                 of_component if count == 0 else (value + of_component[0], pdf + of_component[1])
             )
-        return value, pdf
+        return value, pdf if len(components) < 2 else pdf * (1 / len(components))
 
     def eval_pdf_component(
         self,
@@ -442,12 +495,12 @@ class GlintBSDF(FootprintBSDF):
         active, wi, wo = component.above_horizon(active, si.wi, wo)
         m = component.half_vector(wi, wo)
         query = self.query(si, active, wi, wo)
-        pndf, masking = self.facets(ctx, si)
-        density = self.density(pndf, m, query, si, active)
+        facets = self.facets(ctx, si, active)
+        density = self.density(facets.pndf, m, query, si, active)
         value = component.value(density, wi.z)
-        pdf = pndf.visible_pdf(wi, m, density, query, active)
+        pdf = facets.pndf.visible_pdf(wi, m, density, query, active)
         return (
-            self.scattered(value, component, pndf, masking, ctx, si, wi, wo, m, query, active),
+            self.scattered(value, component, facets, ctx, si, wi, wo, m, query, active),
             dr.select(active, component.density_of_direction(pdf, wo, m), 0),
         )
 
@@ -508,8 +561,7 @@ class GlintBSDF(FootprintBSDF):
         self,
         value: mi.Float | mi.UnpolarizedSpectrum,
         component: Component,
-        pndf: PNDF,
-        masking: SmithMasking | None,
+        facets: Facets,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
         wi: mi.Vector3f,
@@ -519,10 +571,9 @@ class GlintBSDF(FootprintBSDF):
         active: mi.Bool,
     ) -> mi.Spectrum:
         """``value`` times masking, tint, and what the facet lets through, where active."""
-        if masking is not None:
-            value = value * masking.eval(wi, wo, query, ctx.mode, active)
-        tint = self.tint(si, active) if pndf is self.pndf else self.mean_tint(si, active)
-        spectrum = component.throughput(value * tint, ctx.mode, si, wi, wo, m, active)
+        if facets.masking is not None:
+            value = value * facets.masking.eval(wi, component.upward(wo), query, ctx.mode, active)
+        spectrum = component.throughput(value * facets.tint, ctx.mode, si, wi, wo, m, active)
         return dr.select(active, spectrum, 0)
 
     # ----------------------------------------------------------------------------------------------

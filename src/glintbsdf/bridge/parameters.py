@@ -241,6 +241,15 @@ class Parameters:
         check(allowed.holds(value), self.owner, name, str(allowed), value)
         return float(value)
 
+    def number_or_texture(self, name: str, default: float) -> float | mi.Texture:
+        """A number of the declared range, or a texture, which has checked itself."""
+        value = self.props.get(name, default)
+        if isinstance(value, mi.Texture):
+            return value
+        allowed = declared_range(self.owner, name)
+        check(allowed.holds(value), self.owner, name, f"{allowed}, or a texture", value)
+        return float(value)
+
     def whole(self, name: str, default: int | None) -> int | None:
         """A whole number in the declared range, or the default, which may be None."""
         if name not in self.props:

@@ -37,8 +37,8 @@ class Query:
             the half vector counts as constant.
         spread: vectors v (``mi.Vector2f``) whose products v vᵀ add up to the covariance Σ of
             projected normals over which D is averaged; none for no average.
-        parameters: parameters of the P-NDF at the surface point, by name, that take the place of
-            its own: those that have a texture.
+        parameters: values at the surface point, by name, of the P-NDF's parameters that have a
+            texture.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Query:
         footprint: Footprint,
         turn: mi.Matrix2f | None = None,
         spread: tuple[mi.Vector2f, ...] = (),
-        parameters: Mapping[str, object] | None = None,
+        parameters: Mapping[str, mi.Float] | None = None,
     ) -> None:
         self.footprint, self.turn, self.spread = footprint, turn, tuple(spread)
         self.parameters = dict(parameters or {})
@@ -60,10 +60,6 @@ class Query:
     def at(self, footprint: Footprint) -> Query:
         """The same query with another footprint."""
         return Query(footprint, self.turn, self.spread, self.parameters)
-
-    def parameter(self, name: str, default: T) -> T:
-        """A parameter of the P-NDF: its value at the surface point, or ``default`` everywhere."""
-        return self.parameters.get(name, default)  # type: ignore[return-value]
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """What ``make()`` returns, made when it is first asked for.

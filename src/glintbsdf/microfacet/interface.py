@@ -59,6 +59,10 @@ class Component(ABC):
         """Where the facet ``m`` scatters ``wi`` to, and the active lanes in which it does: there
         the facet points up, and the new direction is on the right side of the surface."""
 
+    def upward(self, wo: mi.Vector3f) -> mi.Vector3f:
+        """The direction above the surface whose shadowing ``wo`` has: itself, for reflection."""
+        return wo
+
     @abstractmethod
     def density_of_direction(self, pdf: mi.Float, wo: mi.Vector3f, m: mi.Vector3f) -> mi.Float:
         """Density of ``wo`` (1/steradian) when normals have the density ``pdf`` (1/steradian)."""
@@ -127,7 +131,8 @@ class Interface(ABC):
     """What a facet is made of.
 
     Attributes:
-        components (tuple[Component, ...]): the ways that light takes.
+        components (tuple[Component, ...]): the ways that light takes. No two of them lead to the
+            same direction.
     """
 
     components: tuple[Component, ...]

@@ -182,7 +182,8 @@ class Filtered(PNDF):
     Args:
         normal_map (NormalMap): the map, with slopes up to 1000.
         method (str): one of :data:`METHODS`.
-        alpha (float): base roughness of the material, > 0, and ≤ 1 for ``toksvig``.
+        alpha (float): base roughness of the material, > 0, and ≤ 1 for ``toksvig``. None where
+            every query gives it, as a parameter of the surface point.
         distribution (str): ``beckmann``, or ``ggx`` for ``toksvig`` and ``variance``.
         max_anisotropy (float): ≥ 1, see :class:`~.MomentPyramid`.
         owner (str): the name that errors give, usually the plugin's.
@@ -192,7 +193,7 @@ class Filtered(PNDF):
     Attributes:
         data (mi.TensorXf): the projected normals, H×W×2. Derivatives flow through it; after a
             change of its values, :meth:`parameters_changed` rebuilds the MIP chain.
-        alpha (mi.Float): the base roughness.
+        alpha (mi.Float): the base roughness; None where queries give it.
 
     Raises:
         ParameterError: an argument is out of range, or the map is too steep.
@@ -206,7 +207,7 @@ class Filtered(PNDF):
         self,
         normal_map: NormalMap,
         method: str = "lean",
-        alpha: float = 0.05,
+        alpha: float | None = 0.05,
         distribution: str = "beckmann",
         max_anisotropy: float = 16.0,
         owner: str = "Filtered",
@@ -225,7 +226,8 @@ class Filtered(PNDF):
         check(max_anisotropy >= 1, owner, "max_anisotropy", "a number ≥ 1", max_anisotropy)
         self.name, self.distribution, self.owner = method, distribution, owner
         self.max_anisotropy, self.wrap_mode = float(max_anisotropy), normal_map.wrap_mode
-        self.alpha = mi.Float(alpha)
+        self.alpha = None if alpha is None else mi.Float(alpha)
+        self.max_alpha = 1.0 if method == "toksvig" else inf
         self.check_alpha()
         self.data = mi.TensorXf(normal_map.normals)
         self.normal_map = normal_map
@@ -253,12 +255,13 @@ class Filtered(PNDF):
 
     def check_alpha(self) -> None:
         """Raise :class:`~.ParameterError` unless the roughness is in the method's range."""
-        limit = 1 if self.name == "toksvig" else inf
+        if self.alpha is None:
+            return
         check(
-            dr.all(dr.isfinite(self.alpha) & (self.alpha > 0) & (self.alpha <= limit)),
+            dr.all(dr.isfinite(self.alpha) & (self.alpha > 0) & (self.alpha <= self.max_alpha)),
             self.owner,
             "alpha",
-            "a finite number > 0" + (" and ≤ 1" if limit == 1 else ""),
+            "a finite number > 0" + (" and ≤ 1" if self.max_alpha == 1 else ""),
             self.alpha[0],
         )
 
@@ -270,7 +273,9 @@ class Filtered(PNDF):
     def make_lobe(self, query: Query) -> SlopeLobe:
         """Compute what :meth:`lobe` returns."""
         averages = self.pyramid.average(query)
-        alpha = query.parameter("alpha", self.alpha)
+        alpha = self.alpha
+        if alpha is None:
+            alpha = dr.minimum(query.parameters["alpha"], self.max_alpha)
         return self.method.lobe(averages, dr.square(alpha), self.distribution)
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
@@ -306,7 +311,8 @@ class Filtered(PNDF):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("data", self.data, mi.ParamFlags.Differentiable)
-        callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
+        if self.alpha is not None:
+            callback.put("alpha", self.alpha, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check what has changed, and rebuild. Derivatives keep flowing to the parameters."""
@@ -326,8 +332,9 @@ class Filtered(PNDF):
 
     def __repr__(self) -> str:
         height, width, _ = self.data.shape
+        alpha = "textured" if self.alpha is None else f"{self.alpha[0]:g}"
         return (
-            f"Filtered[{self.name}, {self.distribution}, alpha={self.alpha[0]:g}, "
+            f"Filtered[{self.name}, {self.distribution}, alpha={alpha}, "
             f"{width}×{height} texels, {self.wrap_mode}, {self.nbytes / 2**20:.1f} MiB]"
         )
 
