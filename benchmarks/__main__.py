@@ -1,4 +1,4 @@
-"""``python -m benchmarks NAME``: one group of commands, each imported when it is asked for."""
+"""``python -m benchmarks NAME``: a group of commands, each of which is imported when it runs."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ class Benchmarks(click.Group):
 
 @click.group(cls=Benchmarks, context_settings={"help_option_names": ["-h", "--help"]})
 def benchmarks() -> None:
-    """Measure glintbsdf. Each command prints tables, and says first what was expected.
+    """Measure glintbsdf. Each command prints tables; its help says what was expected.
 
-    With -o, results go to a folder as JSON, pictures too, and a command that was interrupted goes
-    on where it stopped. Nothing comes from a cache on disk: building and compiling are timed.
+    With -o, results are written to a folder, as JSON and images, and a command that was interrupted
+    continues there. Caches on disk are not used, as building and compiling are timed.
     """
 
 
 @contextmanager
 def fresh_caches() -> Iterator[None]:
-    """Let nothing come from a cache on disk that an earlier process has written.
+    """A context without the caches on disk that earlier processes have written.
 
-    Dr.Jit and glintbsdf read the environment when they are imported, which must come later.
+    Dr.Jit and glintbsdf read the environment when they are imported, which must happen later.
     """
     with tempfile.TemporaryDirectory() as kernels:
         os.environ |= {"GLINTBSDF_CACHE": "off", "DRJIT_CACHE_DIR": kernels}
@@ -60,7 +60,7 @@ def fresh_caches() -> Iterator[None]:
 
 
 def run() -> NoReturn:
-    """Run the command line. The exit status is 1 where it was interrupted."""
+    """Run the command line. The exit status is 1 if it was interrupted."""
     from glintbsdf.core.interruption import interruptible
 
     try:

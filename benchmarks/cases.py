@@ -41,14 +41,14 @@ MAPS: dict[str, Callable[..., NormalMap]] = {
 def maps_of(
     run: Run, size: int, *names: str, **options: object
 ) -> dict[str, Callable[[], NormalMap]]:
-    """The procedural maps of these names and the maps from files, each made when it is called."""
+    """Functions that make the procedural maps of these names, or return the maps from files."""
     made = {name: cache(partial(MAPS[name], size, **options)) for name in names}
     return made | {name: (lambda given=given: given) for name, given in run.maps.items()}
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A map, what it was synthesised from if it was, and the clamp of its triangles' Jacobian."""
+    """A map, the clamp of its triangles' Jacobian, and the sample that it is synthesised from."""
 
     name: str
     normal_map: NormalMap
@@ -58,7 +58,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Case:
-    """A class of maps: ``sampled`` from a smaller one, or not; ``given`` by a file, or not."""
+    """A kind of map; ``sampled`` if it is synthesised from a sample, ``given`` if from a file."""
 
     name: str
     surface: Callable[[int], Surface]
@@ -67,12 +67,12 @@ class Case:
 
 
 def procedural(name: str, epsilon: float = 1e-6) -> Case:
-    """A map of :data:`MAPS`, as large as the report asks for."""
+    """A map of :data:`MAPS`, with the size that the report uses."""
     return Case(name, lambda size: Surface(name, MAPS[name](size), epsilon))
 
 
 def synthesised(name: str, sample: str, sample_size: int = 256) -> Case:
-    """A map of patches of a smaller one, which is all that ``glint_mip`` is given of it."""
+    """A map of patches of a smaller one; ``glint_mip`` gets only the smaller one."""
 
     def surface(size: int) -> Surface:
         small = MAPS[sample](sample_size)
@@ -82,16 +82,16 @@ def synthesised(name: str, sample: str, sample_size: int = 256) -> Case:
 
 
 def given(path: Path) -> Case:
-    """A map from a file, at its own size."""
+    """A map from a file, with its own size."""
     return Case(path.stem, lambda size: Surface(path.stem, NormalMap.load(path)), given=True)
 
 
-#: How maps are synthesised.
+#: Parameters of the synthesis of maps.
 SYNTHESIS = {"patch_size": 64, "overlap": 2, "balance": 0.9, "seed": 0}
 
-#: Six classes of maps, and synthesised ones. Facets that are quite flat are points on the disk of
-#: normals, whose highlight has the area ``epsilon``: of 1e-6 it would be a needle that no grid of
-#: points finds.
+#: Six kinds of maps, and a synthesised one. Flat facets are points on the disk of normals, and
+#: their highlight has the area ``epsilon``. With 1e-6, the highlight of flakes would be a spike
+#: that no grid of points finds.
 CASES = [
     *(procedural(name) for name in ("isotropic", "brushed", "scratched")),
     procedural("flakes", epsilon=1e-3),
@@ -99,12 +99,12 @@ CASES = [
     synthesised("isotropic patches", "isotropic"),
 ]
 
-#: Side of the stiff maps, texels: the fewest for which there are clusters.
+#: Side of the stiff maps, texels: the smallest one with clusters.
 STIFF_SIZE = 32
 
 
 def step_edge() -> NormalMap:
-    """Two planes: all triangles are degenerate, those across the edge as long as can be."""
+    """Two planes: all triangles are degenerate, and those across the edge are very long."""
     normals = np.zeros((STIFF_SIZE, STIFF_SIZE, 2))
     half = STIFF_SIZE // 2
     normals[:, :half], normals[:, half:] = (-0.3, 0), (0.6, 0.1)
@@ -112,14 +112,14 @@ def step_edge() -> NormalMap:
 
 
 def rank_one() -> NormalMap:
-    """Grooves: normals on a line, of one direction of the map alone; every Jacobian is singular."""
+    """Grooves: normals on a line, which vary in one direction only; every Jacobian is singular."""
     wave = 0.6 * np.sin(2 * np.pi * np.arange(STIFF_SIZE) / STIFF_SIZE * 3)
     normals = wave[None, :, None] * np.array([0.8, 0.6])
     return NormalMap(np.broadcast_to(normals, (STIFF_SIZE, STIFF_SIZE, 2)))
 
 
 def white_noise(shape: tuple[int, int], wrap_mode: str = "repeat") -> NormalMap:
-    """Normals evenly over the disk, each texel another, to slopes of 200."""
+    """Independent normals, uniform over the disk up to slopes of 200."""
     rng = np.random.default_rng(1)
     radius, angle = np.sqrt(rng.random(shape)), rng.uniform(0, 2 * np.pi, shape)
     normals = 0.99999 * radius * np.stack([np.cos(angle), np.sin(angle)])
@@ -143,7 +143,7 @@ STIFF_MAPS: dict[str, Callable[[], NormalMap]] = {
 # --------------------------------------------------------------------------------------------------
 
 
-#: Places of footprints, UV, over which errors are averaged.
+#: Positions of footprints (UV) over which errors are averaged.
 PLACES = ((0.37, 0.61), (0.81, 0.22), (0.13, 0.45))
 
 
@@ -177,7 +177,7 @@ class Ellipse:
         return axes.T @ axes
 
     def at(self, normal_map: NormalMap, uv: Iterable) -> Footprint:
-        """Footprints at ``uv`` (2,) or (2, N): as many lanes as places."""
+        """Footprints at ``uv`` (2,) or (2, N), one lane for each."""
         du, dv = (
             mi.Vector2f(*(dr.opaque(mi.Float, float(x)) for x in axis))
             for axis in self.axes(normal_map)
@@ -189,7 +189,7 @@ class Ellipse:
 def queries(normal_map: NormalMap, ellipse: Ellipse, count: int, epsilon: float = 1e-6) -> tuple:
     """``(m, footprint)``: random places on the map, each with a normal drawn from its exact P-NDF.
 
-    So a BSDF's samples ask; light sampling asks for other normals too, where D is often 0.
+    Samples of a BSDF are such queries. Samples of lights have other normals, too, with D often 0.
     """
     uv, u = np.random.default_rng(7).random((2, 2, count), dtype=np.float32)
     footprint = ellipse.at(normal_map, uv)
@@ -201,7 +201,7 @@ def queries(normal_map: NormalMap, ellipse: Ellipse, count: int, epsilon: float 
 
 
 def grid_of_normals(bounds, res: int, jitter: np.random.Generator | None = None) -> mi.Vector2f:
-    """Normals at the middle of ``res``² cells of the rectangle ``bounds``, or jittered in them."""
+    """Normals at the centres of ``res``² cells of the rectangle ``bounds``, or jittered in them."""
     lower, upper = np.array(bounds)
     offset = 0.5 if jitter is None else jitter.random((2, res, res))
     row, column = (np.indices((res, res)) + offset) / res
@@ -215,7 +215,7 @@ def grid_of_normals(bounds, res: int, jitter: np.random.Generator | None = None)
 
 SCENES = ROOT / "scenes"
 
-#: The map of ``curved_patch.xml``, and how often it repeats there.
+#: The map of ``curved_patch.xml``, and its repetitions there.
 PATCH_MAP, UV_SCALE = SCENES / "maps" / "isotropic.exr", 2
 
 #: Radius and radiance of the lights of ``curved_patch.xml``.
@@ -229,11 +229,11 @@ def curved_patch(
     light_radius: float = LIGHT_RADIUS,
     field_of_view: float = 45,
 ) -> mi.Scene:
-    """``scenes/curved_patch.xml`` with ``material``, the dictionary of a BSDF; both sides reflect.
+    """``scenes/curved_patch.xml`` with ``material``, the dictionary of a BSDF, on both sides.
 
-    Lights of another radius keep their power.
+    Lights keep their power with another radius.
     """
-    dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba reads no image with a single one
+    dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba hangs with one
     collect_former_scenes()
     text = (SCENES / "curved_patch.xml").read_text()
     start = text.index('<bsdf type="glint_manifold">')
@@ -263,8 +263,8 @@ def scaled(scale: float) -> mi.ScalarTransform4f:
 def spread_for(radius: float, texels: int, size: int) -> float:
     """The ``pixel_spread`` with which footprints on the curved patch have this radius, 3σ (texels).
 
-    σ is half a pixel; the radius is the geometric mean of both axes, its median over the patch.
-    ``texels`` is the side of the map, ``size`` that of the picture.
+    σ is half a pixel. The radius is the geometric mean of both axes, and its median over the patch.
+    ``texels`` is the side of the map, ``size`` the side of the image.
     """
     scene = curved_patch({"type": "diffuse"}, size, 1)
     sensor = scene.sensors()[0]
@@ -281,7 +281,7 @@ def spread_for(radius: float, texels: int, size: int) -> float:
 def picture_of(
     shape: dict, origin: list, up: list, fov: float, size: int, lights: dict, **options
 ) -> mi.Scene:
-    """A square picture of one shape around the origin; ``options``: spp, max_depth, rfilter."""
+    """A scene of one shape for a square image; ``options`` are spp, max_depth and rfilter."""
     collect_former_scenes()
     film = {"type": "hdrfilm", "width": size, "height": size}
     film["rfilter"] = {"type": options.get("rfilter", "box")}

@@ -1,8 +1,8 @@
-"""One harness for all commands: times taken in turn, measured units that are kept, tables, options.
+"""The harness of all commands: alternating timings, storage of measured units, tables, options.
 
-A command is a family of parts, plain functions of a :class:`Run`. A part measures the rows of a
-:class:`Table`. With ``-o`` each row is kept as a unit of a :class:`Store`, so that a command which
-was interrupted goes on where it stopped.
+A command is a family of parts, which are functions of a :class:`Run`. A part measures the rows of a
+:class:`Table`. With ``-o``, each row is stored as a unit of a :class:`Store`, so that a command
+that was interrupted continues there.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def timed(action: Callable) -> tuple:
-    """Return what an action returns, evaluated, and the seconds it took."""
+    """Return the evaluated result of an action, and the seconds that it took."""
     dr.sync_thread()
     start = time.perf_counter()
     result = action()
@@ -51,16 +51,16 @@ def timed(action: Callable) -> tuple:
 
 
 def seconds(work: Callable, *arguments: object) -> float:
-    """Wall-clock time until what ``work(*arguments)`` returns is evaluated."""
+    """Wall-clock seconds until the result of ``work(*arguments)`` is evaluated."""
     return timed(lambda: work(*arguments))[1]
 
 
 def seconds_in_turn(works: Sequence[Callable], repetitions: int) -> np.ndarray:
     """Times (repetitions, works). All works run in turn within each repetition.
 
-    So ratios can be taken within a repetition, and what else the machine does touches all alike.
-    Every work is called with the number of the repetition, from 1: a seed. The first call of a work
-    compiles; the caller has made it before.
+    So ratios can be taken within a repetition, and other work of the machine affects all alike.
+    Each work is called with the number of the repetition, from 1, as a seed. The caller must have
+    called every work once before, as the first call compiles.
     """
     return np.array([[seconds(work, k) for work in works] for k in range(1, repetitions + 1)])
 
@@ -77,7 +77,7 @@ def rmse(image: np.ndarray, reference: np.ndarray) -> float:
 
 @contextmanager
 def single_thread() -> Iterator[None]:
-    """Let Dr.Jit compute in one thread within the block."""
+    """A context in which Dr.Jit computes in one thread."""
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
@@ -94,10 +94,10 @@ _TEXT = "__json__"
 
 
 class Store:
-    """Measured units in a folder, for one ``context``: whatever all of them depend on.
+    """Measured units in a folder; ``context`` is everything that all of them depend on.
 
-    A unit is one file, named after a hash of the context and of its own key. A file appears whole
-    or not at all.
+    A unit is one file, whose name is a hash of the context and of the unit's key. A file is
+    complete or does not exist.
     """
 
     def __init__(self, folder: Path, context: dict) -> None:
@@ -110,7 +110,7 @@ class Store:
         return self.folder / f"{hashlib.blake2b(text.encode(), digest_size=12).hexdigest()}.npz"
 
     def get(self, key: dict, measure: Callable[[], tuple[object, dict[str, np.ndarray]]]) -> tuple:
-        """``(values, arrays)`` of a unit: stored, or measured now and stored."""
+        """``(values, arrays)`` of a unit, from the store, or measured now and stored."""
         path = self.path(key)
         if not path.exists():
             values, arrays = measure()
@@ -123,7 +123,7 @@ class Store:
 
 
 def machine(*modules: str) -> dict:
-    """Describe what figures are measured on; ``modules`` are further files that measure."""
+    """Describe the machine and the software; ``modules`` are further files that measure."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -143,14 +143,14 @@ def machine(*modules: str) -> dict:
 
 
 def open_store(folder: Path, *modules: str) -> Store:
-    """The store in a folder, for this machine and this source, whatever the commit."""
+    """The store in a folder, for this machine and this source; the commit does not count."""
     context = machine(*modules)
     del context["commit"]
     return Store(folder / "measured", context)
 
 
 def source_hash(*modules: str) -> str:
-    """Hash the source of the package, what of the benchmarks measures, and ``modules``."""
+    """Hash the source of the package, of the measuring benchmarks, and of ``modules``."""
     measuring = ("src/**/*.py", "plugins/*.py", "benchmarks/*.py", "benchmarks/measures/*.py")
     paths = {path for pattern in measuring for path in ROOT.glob(pattern)}
     digest = hashlib.blake2b(digest_size=8)
@@ -168,7 +168,7 @@ def _processor() -> str:
 
 
 def _commit() -> str | None:
-    """The commit that is checked out, with a + where files have changed since; None outside git."""
+    """The current commit, with a + if files have changed since; None outside of git."""
     try:
         command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+"]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
@@ -189,10 +189,10 @@ def new_console() -> Console:
 
 @dataclass
 class Run:
-    """One run of a command: what was asked for, and where results go.
+    """One run of a command: its options and results.
 
-    ``maps`` are maps from files, by name; ``only`` is a text that the label of each row must hold;
-    ``store`` and ``output`` are None where nothing is kept.
+    ``maps`` are maps from files, by name; ``only`` is a text that the label of each row must have;
+    ``store`` and ``output`` are None if nothing is stored.
     """
 
     quick: bool = False
@@ -206,7 +206,7 @@ class Run:
 
     @contextmanager
     def table(self, name: str) -> Iterator[Table]:
-        """A table whose rows appear while they are measured; a log gets it at its end."""
+        """A table that a terminal shows while rows are measured, and a log at the end."""
         table = Table(self, name)
         self.results[name] = table.rows
         if self.console.is_terminal:
@@ -219,7 +219,7 @@ class Run:
             self.console.print(table.shown())
 
     def save_pictures(self, name: str, rows: list[list[np.ndarray]]) -> None:
-        """Write a table of pictures of equal size, each (H, W) or (H, W, 3), linear, as PNG."""
+        """Write a table of images of equal size, each (H, W) or (H, W, 3), linear, as a PNG."""
         if self.output is None:
             return
         cells = [
@@ -238,9 +238,10 @@ class Table:
         self.rows: list[dict] = []
 
     def measure(self, key: dict, work: Callable[[], dict | list[dict]]) -> list[dict]:
-        """Add the rows of one unit: ``key`` and what ``work`` returns, one dictionary or several.
+        """Add the rows of one unit, and return them. ``work`` returns one dictionary or several.
 
-        They are taken from the store where an earlier run has measured them. Returns the rows.
+        A row is ``key`` and such a dictionary. Rows that an earlier run has stored are not
+        measured.
         """
         label = ", ".join(str(value) for value in (self.name, *key.values()))
         if self.run.only not in label:
@@ -261,7 +262,7 @@ class Table:
         return rows
 
     def shown(self) -> rich.table.Table:
-        """The table as it is printed; a row that lacks a column has a dash there."""
+        """The table to print; a row without a value in a column has a dash there."""
         table = rich.table.Table(title=self.name)
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         for column in columns:
@@ -295,17 +296,17 @@ def output_option(required: bool = False) -> click.Option:
         required=required,
         type=click.Path(file_okay=False, path_type=Path),
         metavar="DIR",
-        help="Folder for results, pictures, and what has been measured.",
+        help="Folder for results, images, and measured units.",
     )
 
 
 #: Options of every family.
 SHARED = (
     click.Option(["--quick"], is_flag=True, help="Fewer and smaller cases."),
-    click.Option(["--only"], default="", metavar="TEXT", help="Rows whose name holds this."),
+    click.Option(["--only"], default="", metavar="TEXT", help="Only rows whose name has this."),
     click.Option(["--map", "maps"], multiple=True, metavar="FILE", help="A further map."),
     click.Option(
-        ["--repetitions"], type=click.IntRange(1), default=3, show_default=True, help="Of times."
+        ["--repetitions"], type=click.IntRange(1), default=3, show_default=True, help="Of timings."
     ),
     output_option(),
     VARIANT,
@@ -313,9 +314,9 @@ SHARED = (
 
 
 def family(name: str, *parts: Callable[[Run], None]) -> click.Command:
-    """A command that runs ``parts``: all of them, or those that are named.
+    """A command that runs all ``parts``, or the ones that are named.
 
-    The help of the command is the docstring of the module of the parts, and theirs.
+    Its help consists of the docstrings of the parts' module and of the parts.
     """
     named = {part.__name__: part for part in parts}
     module = sys.modules[parts[0].__module__]
@@ -330,7 +331,7 @@ def family(name: str, *parts: Callable[[Run], None]) -> click.Command:
         variant: str,
     ) -> None:
         mi.set_variant(variant)
-        dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba reads no image with a single one
+        dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba hangs with one
         given = {Path(path).stem: NormalMap.load(path) for path in maps}
         store = None
         if output is not None:

@@ -1,7 +1,7 @@
-"""Every method that is compared, at a ladder of settings. One list serves all commands.
+"""All methods to compare, each with a series of settings. All commands use this list.
 
-A method of the register (:func:`glintbsdf.pndf.methods`) that has no ladder here takes part with
-the settings that it is registered with.
+A method of the register (:func:`glintbsdf.pndf.methods`) that has no series here has the settings
+that it is registered with.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from glintbsdf.check.truth import mirrors
 from glintbsdf.pndf import methods
 from glintbsdf.pndf.manifold.mesh import equilateral
 
-#: Elements, lobes and filters add this roughness σ_r on the disk to the map, so that they answer
-#: one question. The α of a filter is √2 times as large.
+#: Elements, lobes and filters all have this roughness σ_r on the disk, so that they can be
+#: compared. The α of a filter is √2 times as large.
 SIGMA_R = 0.005
 ALPHA = SIGMA_R * 2**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A glint BSDF at one setting.
+    """A glint BSDF with one setting.
 
     ``plugin`` is its dictionary for ``mi.load_dict``, without the map. ``rung`` is the number that
-    the ladder of its family goes by, if it does. ``quick`` says whether the quick report has it;
-    ``pndf``, ``image`` and ``cost`` whether it is compared at that level; ``mapped`` whether it has
-    a map: one without can only be compared in ``cost``.
+    orders the series of its family, if there is one. ``quick`` says whether the quick report has
+    it; ``pndf``, ``image`` and ``cost`` whether these comparisons have it; ``mapped`` whether it
+    has a map: only ``cost`` can compare methods without a map.
     """
 
     family: str
@@ -50,11 +50,11 @@ class Method:
 
     @property
     def synthesises(self) -> bool:
-        """Whether it needs a sample, rather than a map."""
+        """Whether it needs a sample to synthesise its map from."""
         return self.plugin["type"] == "glint_mip"
 
     def suits(self, case: Case) -> bool:
-        """Whether it can show a map of this case."""
+        """Whether it can render a map of this case."""
         return self.mapped and (case.sampled or not self.synthesises)
 
     def describe(self, surface: Surface) -> dict:
@@ -68,7 +68,7 @@ class Method:
         return {**self.plugin, **options, **normals}
 
     def build(self, surface: Surface):
-        """Make the P-NDF, without masking, which is no part of it."""
+        """Make the P-NDF; no masking is built for it."""
         parameters = {"masking": "none"}
         if self.plugin["type"] == "glint_manifold":
             parameters["epsilon"] = surface.epsilon
@@ -86,7 +86,7 @@ def ladder(
     cost: Iterable = (),
     **plugin: object,
 ) -> list[Method]:
-    """Make a method per value of a parameter; ``quick``, ``image``, ``cost`` name some of them."""
+    """A method for each value of a parameter; ``quick``, ``image``, ``cost`` are some of these."""
     label = parameter if label is None else label
     return [
         Method(
@@ -132,7 +132,7 @@ LADDERS = [
     *mip("lobes, 32 clusters", "lod_scale", (0.25, 0.5, 1.0), label="C_P"),
     *filters("filter", "method", FILTERS, label="", quick=("toksvig", "lean"), image=FILTERS,
              cost=FILTERS),
-    # Its lobe is LEAN's: only masking and projection differ, which a P-NDF does not have.
+    # Its lobe is LEAN's; only the masking differs, which is not part of the P-NDF.
     Method("filter", "leadr", {"type": "glint_filtered", "method": "leadr", "alpha": ALPHA},
            quick=False, pndf=False),
     *(glitter(f"density {d}", density=float(d)) for d in (4, 8, 12)),
@@ -155,21 +155,21 @@ METHODS = LADDERS + [
 
 
 def brute_force(normal_map: NormalMap, **parameters: object) -> dict:
-    """Mirrors that follow the map, found by sampling alone."""
+    """Mirrors that follow the map; sampling alone averages over a pixel."""
     return mirrors(normal_map, **parameters)
 
 
 def rough(normal_map: NormalMap, to_uv: object = None, **parameters: object) -> dict:
-    """Mitsuba's own material, as rough as the whole map, without any glint."""
+    """Mitsuba's own material with the roughness of the whole map, without glints."""
     alpha_u, alpha_v = normal_map.roughness()
     return {"type": "roughconductor", "alpha_u": alpha_u, "alpha_v": alpha_v, **parameters}
 
 
-#: Images are compared with stock BSDFs as well; each function makes the dictionary of one.
+#: Mitsuba's own BSDFs, for comparisons of images; each function makes the dictionary of one.
 BASELINES: dict[str, Callable[..., dict]] = {"brute force": brute_force, "roughconductor": rough}
 
 # --------------------------------------------------------------------------------------------------
-#  Stiff settings, and what each method promises
+#  Stiff settings, and the energy that each method promises
 # --------------------------------------------------------------------------------------------------
 
 EVERYWHERE, VERTICAL = "everywhere", "vertical"
@@ -178,12 +178,12 @@ NO_MAP = ("none",)
 
 @dataclass(frozen=True)
 class Stiff:
-    """A plugin with parameters, and what it promises.
+    """A plugin with parameters, and how to test it.
 
-    ``furnace``: where no more light is reflected than arrives: everywhere, or seen from straight
-    above. ``sweep``: the stiff parameter and its values. ``lanes``: queries for NaN, fewer where
-    one costs much. ``double``: whether it can compute in float64. ``large``: whether its density is
-    tested under a footprint of half the map as well.
+    ``furnace``: views from which it must not reflect more light than arrives: everywhere, or from
+    the vertical. ``sweep``: the stiff parameter and its values. ``lanes``: number of queries for
+    NaN, smaller if a query is expensive. ``double``: whether it can compute in float64. ``large``:
+    whether to test its density under a footprint of half the map as well.
     """
 
     plugin: str
@@ -205,7 +205,7 @@ wu = partial(Stiff, "glint_manifold")
 yan = partial(Stiff, "glint_elements")
 zirr = partial(Stiff, "glint_grid", maps=NO_MAP)
 filtered = partial(Stiff, "glint_filtered")
-#: Maps of ``glint_mip``, which makes one of twice the side; samples must be larger than a patch.
+#: Samples for ``glint_mip``, whose map has twice their side; they must be larger than a patch.
 SQUARE_MAPS = tuple(STIFF_MAPS)[:6]
 SMALL_MIP = {"output_size": 2 * STIFF_SIZE, "patch_size": STIFF_SIZE // 2, "overlap": 4,
              "clusters": 8}  # fmt: skip
@@ -217,7 +217,7 @@ STIFF: dict[str, Stiff] = {
     "manifold, no masking": wu({"masking": "none"}, VERTICAL),
     "manifold, threshold": wu({"threshold": 1e-2}, sweep=("threshold", decades(-6, 2))),
     "manifold, max_error": wu({"max_error": 0.1}, sweep=("max_error", decades(-6, 2)), large=True),
-    # Its far side is LEAN's lobe, with the masking of the map.
+    # For large footprints it is LEAN's lobe, with the masking of the map.
     "manifold, hand_over": wu({"hand_over": 0.7}, VERTICAL),
     "elements": yan({}, VERTICAL, ("sigma_r", decades(-8, 0))),
     "elements, flat": yan({"elements": "flat", "step": 2.0}, VERTICAL),
@@ -226,7 +226,7 @@ STIFF: dict[str, Stiff] = {
         "glint_mip", SMALL_MIP, VERTICAL, ("sigma_r", decades(-8, 0)), SQUARE_MAPS, large=True
     ),
     "diffuse": Stiff("glint_diffuse", {"reflectance": 1.0}, lanes=64),
-    # Mitsuba has frames in float32 alone.
+    # Mitsuba's frames exist in float32 only.
     "diffuse, Oren–Nayar": Stiff(
         "glint_diffuse", {"reflectance": 1.0, "method": "oren_nayar"}, double=False
     ),
@@ -246,9 +246,9 @@ STIFF: dict[str, Stiff] = {
     for entry in REGISTERED
 }  # fmt: skip
 
-#: Parameters stand for widths of lobes of normals; that of a degenerate triangle is the radius of
-#: the circle in it. A lobe can be judged down to the narrowest: float32 half vectors are 6e-8
-#: apart, and two directions give them with an error of about 1e-7.
+#: Width of the lobe of normals for the value of a parameter; for a degenerate triangle, the radius
+#: of its incircle. Narrower lobes than NARROWEST_LOBE are not judged: float32 half vectors are 6e-8
+#: apart, and have an error of about 1e-7 if they are computed from two directions.
 WIDTHS: dict[str, Callable[[float], float]] = {
     "alpha": lambda alpha: alpha,
     "sigma_r": lambda sigma_r: sigma_r,

@@ -1,7 +1,7 @@
-"""Errors of P-NDFs and of moments, where those of error_vs_time do not suffice.
+"""Errors of P-NDFs and of moments that error_vs_time does not measure.
 
-Every part states the noise of the reference beside the error: the relative L1 difference that an
-exact density would show.
+Beside an error, every part prints the noise of the reference: the relative L1 difference of an
+exact density.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ SETS = 16
 def exactness(
     build: Callable[[], Manifold], make: Callable[[], NormalMap], kernel: str, ellipse: Ellipse
 ) -> dict:
-    """Error of the exact P-NDF, what noise alone makes, and the p-value of Pearson's χ² test."""
+    """Error of the exact P-NDF, the error from noise alone, and the p-value of Pearson's χ²
+    test."""
     manifold, normal_map = build(), make()
     area, samples = ellipse.major * ellipse.minor, 1_000_000
-    # Points enough for the spikes of small footprints, in a minute at most.
+    # Enough points for the spikes of small footprints, within a minute.
     res, points = (32, 24) if area <= 20 else (32, 8) if area <= 1000 else (16, 4)
     options = {"kernel": kernel, "epsilon": EPSILON, "res": res, "samples": samples, "seed": 1}
     reference = binned_pndf(normal_map, PLACES[0], ellipse.covariance(normal_map), **options)
@@ -62,10 +63,9 @@ def exactness(
 def exact(run: Run) -> None:
     """The exact manifold P-NDF on every procedural map, with all kernels.
 
-    Footprints go from 0.5 to 200 texels, round and stretched, along the axes and rotated. Both
-    sides have noise: the reference that of its counts, the density that of its average over a bin,
-    whose error is measured. Expected: p-values uniform in [0, 1]; the smallest of
-    n is about 1/n.
+    Footprints have 0.5 to 200 texels, are round or stretched, and along the axes or rotated. The
+    counts of the reference have noise, and so have the averages of the density over a bin, whose
+    error is measured. Expected: p-values uniform in [0, 1], so the smallest of n is about 1/n.
     """
     names = ("isotropic", "brushed", "scratched", "flakes", "leather", "flat", "tilted")
     with run.table("exact") as table:
@@ -84,12 +84,13 @@ def exact(run: Run) -> None:
 #  Filters
 # --------------------------------------------------------------------------------------------------
 
-#: Radius of the sun's disk, as half vectors.
+#: Radius of the sun's half vectors, in projected normals.
 SUN = 0.0023
 
 
 def distance(make: Callable[[], NormalMap], sigma: float, samples: int) -> dict:
-    """Relative L1 between LEAN's lobe and the blurred binned P-NDF, and the noise's part of it."""
+    """Relative L1 difference of LEAN's lobe and the blurred binned P-NDF, and that of noise
+    alone."""
     normal_map, ellipse, res, points = make(), Ellipse.round(sigma), 48, 4
     options = {"sigma_r": SUN, "res": res, "samples": samples}
     reference = binned_pndf(normal_map, (0.4, 0.7), ellipse.covariance(normal_map), **options)
@@ -101,9 +102,9 @@ def distance(make: Callable[[], NormalMap], sigma: float, samples: int) -> dict:
 
 
 def hand_over(run: Run) -> None:
-    """LEAN's lobe against the P-NDF, blurred by the sun's disk, by the size of the footprint.
+    """LEAN's lobe against the P-NDF, both blurred by the sun's disk, for sizes of the footprint.
 
-    How large must a footprint be for glints to be gone?
+    It answers for which footprints glints are gone.
     """
     size, samples = (256, 500_000) if run.quick else (512, 4_000_000)
     names = ("isotropic", "brushed", "leather", "scratched", "flakes")
@@ -114,7 +115,7 @@ def hand_over(run: Run) -> None:
                 table.measure({"map": name, "sigma": sigma}, work)
 
 
-#: Standard deviations of footprints, texels: levels of the chain, between levels, stretched.
+#: Standard deviations of footprints, texels: equal to levels, between levels, and stretched.
 FOOTPRINTS = (
     *((sigma, sigma) for sigma in (0.5, 1, 2**0.5, 8, 16, 1.2, 3.4, 7, 27)),
     *((3, 2), (4, 2), (8, 2), (16, 2), (30, 1.5)),
@@ -124,7 +125,7 @@ FOOTPRINTS = (
 def moment_errors(
     make: Callable[[], NormalMap], major: float, minor: float, count: int
 ) -> dict[str, float]:
-    """Errors of LEAN's moments for ``count`` random footprints of these axes, texels."""
+    """Errors of LEAN's moments for ``count`` random footprints with these axes (texels)."""
     normal_map = make()
     size = np.array([normal_map.width, normal_map.height])
     rng = np.random.default_rng(3)
@@ -149,7 +150,7 @@ def moment_errors(
 def moments(run: Run) -> None:
     """Means and mean squares of slopes of LEAN's lobe against sums over the map's mesh, in float64.
 
-    Footprints are random; errors are relative to the root mean square slope of the map, and to its
+    Footprints are random. Errors are relative to the map's root mean square slope, and to its
     square.
     """
     names = ("isotropic", "brushed", "leather", "scratched", "flakes")

@@ -1,6 +1,6 @@
-"""Whole renders of every method over roughconductor; the time and memory of building.
+"""Rendering times of every method relative to roughconductor; time and memory of building.
 
-The methods are those of ``benchmarks/methods.py`` that are marked for it, at their own settings.
+The methods are the ones in ``benchmarks/methods.py`` that are marked for ``cost``.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from benchmarks.methods import METHODS, Method, rough
 from glintbsdf import NormalMap
 from glintbsdf.scene.rendering import pixel_angle
 
-#: Footprints on the curved patch have these sizes, in pixels.
+#: Sizes of footprints on the curved patch, pixels.
 PIXELS = (1 / 16, 1, 4)
 
-#: The plane is seen from so many degrees above it, from these distances.
+#: Elevations (degrees) and distances of the views of the plane.
 ELEVATIONS, DISTANCES, FIELD_OF_VIEW = (90, 10), (1.0, 30.0), 30.0
 
 
 def on_patch(
     method: Method, footprints: tuple[float, ...], normal_map: NormalMap, size: int, run: Run
 ) -> list[dict]:
-    """A method on the curved patch under footprints of so many pixels, the structure built once."""
+    """A method on the curved patch, for footprints of several sizes; its structure is built
+    once."""
     shared = {"material": "Cr", "to_uv": scaled(UV_SCALE)}
     smooth = curved_patch(rough(normal_map, **shared), size, 16)
     angle = pixel_angle(smooth.sensors()[0])
@@ -46,7 +47,7 @@ def on_patch(
 
 
 def on_plane(method: Method, elevation: float, distance: float, size: int, run: Run) -> dict:
-    """A method without a map on the plane, under footprints of a pixel."""
+    """A method without a map on the plane, for footprints of a pixel."""
     view = {"elevation": elevation, "distance": distance, "fov": FIELD_OF_VIEW}
     conductor = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3}
     smooth = plane(conductor | {"material": "Al"}, **view, size=size, spp=16)
@@ -57,14 +58,14 @@ def on_plane(method: Method, elevation: float, distance: float, size: int, run: 
 
 
 def renders(run: Run) -> None:
-    """Times of frames of 400², 16 samples per pixel, stock ``path``, over roughconductor's.
+    """Times of frames relative to roughconductor: 400², 16 samples per pixel, Mitsuba's ``path``.
 
-    Methods with a map are on the curved patch, where a footprint of f pixels is a ``pixel_spread``
-    of f times a pixel's angle; ``roughconductor`` is as rough as the map. ``glint_grid`` is on a
-    plane, seen along its normal and at 10° to it, from two distances. A method and
-    ``roughconductor`` render in turn in every repetition, after a first frame that compiles, with
-    no other material alive: Dr.Jit compiles all there are into every frame. Ratios are medians of
-    those within a repetition. Loading includes building.
+    Methods with a map are on the curved patch. A footprint of f pixels is a ``pixel_spread`` of f
+    times a pixel's angle, and ``roughconductor`` has the roughness of the map. ``glint_grid`` is on
+    a plane, seen along its normal and from 10° above it, from two distances. A method and
+    ``roughconductor`` render in turn in every repetition, after a first frame that compiles. No
+    other material exists then, as Dr.Jit compiles all that exist into every frame. Ratios are
+    medians of the ratios within a repetition. Loading includes building.
     """
     size = 100 if run.quick else 400
     maps = {"isotropic": partial(NormalMap.load, PATCH_MAP), **maps_of(run, 0)}
@@ -85,7 +86,7 @@ def renders(run: Run) -> None:
                     table.measure({"method": method.name, **where}, work)
 
 
-#: Papers report these bytes; keys are the plugin, sides of sample and map, and the setting.
+#: Bytes in the papers, by plugin, sides of sample and map, and setting.
 PAPERS = {
     ("glint_elements", 2048, 2048, "step 0.5"): 1120e6,
     ("glint_elements", 2048, 2048, "step 1.0"): 280e6,
@@ -95,7 +96,7 @@ PAPERS = {
 
 
 def built(method: Method, sample: NormalMap, size: int) -> dict:
-    """Time and memory of a structure; with a sample, of a map of ``size``² texels made of it."""
+    """Time and memory of a structure; ``size`` is the side of a map that a sample is made to."""
     description = method.plugin | {"data": mi.TensorXf(sample.normals)}
     if method.synthesises:
         description |= {"output_size": size}
@@ -112,12 +113,12 @@ def built(method: Method, sample: NormalMap, size: int) -> dict:
 
 
 def building(run: Run) -> None:
-    """Time and memory of the structures of an isotropic map, the cache being off.
+    """Time and memory of the structures of an isotropic map, without the cache.
 
-    ``glint_mip`` makes its map of a sample of 256² or 512² texels, the others take it whole. Bytes
-    per texel are those of the map that the method is given. Beside them stand the paper's figures
-    where there are any: 720 MB of elements and 400 MB of hierarchy at h = ½ (Yan16), and the lobes
-    and look-up table of Table 2 (Tan22).
+    ``glint_mip`` makes its map from a sample of 256² or 512² texels; the others get the whole map.
+    Bytes are per texel of the map or sample that a method gets. The papers' figures are shown if
+    there are any: 720 MB of elements and 400 MB of hierarchy for h = ½ (Yan16), and the lobes and
+    look-up table of Table 2 (Tan22).
     """
     with run.table("building") as table:
         for method in METHODS:

@@ -1,4 +1,4 @@
-"""Energy: what every method with a map reflects of uniform light, beside ray tracing."""
+"""Energy: the share of uniform light that methods with a map reflect, and that of ray tracing."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ METHODS = {
 
 
 def plugin(parameters: dict, normal_map: NormalMap) -> mi.BSDF:
-    """The BSDF of one of :data:`METHODS` on a map. A synthesised one is a shuffled copy of it."""
+    """The BSDF of one of :data:`METHODS` on a map; ``glint_mip`` synthesises its map from it."""
     data = {"data": mi.TensorXf(normal_map.normals), "footprint_sigma": 1.0}
     if parameters["type"] == "glint_mip":
         data |= {"output_size": normal_map.width, "patch_size": normal_map.width // 4}
@@ -45,13 +45,13 @@ def plugin(parameters: dict, normal_map: NormalMap) -> mi.BSDF:
 
 
 def tracing(surface: Surface, quick: bool) -> dict:
-    """A row: the truth at each angle."""
+    """A row: the reference at each angle."""
     rays = 100_000 if quick else 2_000_000
     return {f"mean at {angle}°": traced_energy(surface, angle, rays) for angle in ANGLES}
 
 
 def reflecting(parameters: dict, surface: Surface, sigma: float, quick: bool) -> dict:
-    """A row: the worst place and the mean of a method at each angle."""
+    """A row: the mean energy of a method, and the energy of the worst place, at each angle."""
     bsdf, row = plugin(parameters, surface.normal_map()), {}
     for angle in ANGLES:
         places, samples = 100, 512 if quick else 4096
@@ -62,12 +62,13 @@ def reflecting(parameters: dict, surface: Surface, sigma: float, quick: bool) ->
 
 
 def places(run: Run) -> None:
-    """Energy at 100 places of a surface of slopes 0.15, under footprints of some texels.
+    """Energy at 100 places of a surface with slopes of 0.15, under footprints of a few texels.
 
-    For each angle of incidence the mean over the places, and the largest energy of any, less three
-    standard errors. The truth is the share of rays that leave the displaced surface, of mirrors,
-    after one reflection. Expected: no place above 1.02, and means within 2 % of the truth up to
-    69°. At 83° Smith's masking is darker, as it knows nothing of the facets beside a place.
+    The table has, for each angle of incidence, the mean over the places, and the largest energy of
+    a place, minus three standard errors. The reference is the share of rays that leave the
+    displaced surface, which is a mirror, after one reflection. Expected: no place is above 1.02,
+    and means are within 2 % of the reference up to 69°. At 83° Smith's masking is darker, as it
+    does not know the facets beside a place.
     """
     surface = Surface(128 if run.quick else 256)
     with run.table("places") as table:

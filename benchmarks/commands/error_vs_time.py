@@ -1,15 +1,15 @@
-"""Error against run time of every method: P-NDFs and images, at a ladder of settings.
+"""Error against run time of every method, for P-NDFs and for images, with a series of settings.
 
-*P-NDF level*: six procedural maps and any map given, round footprints of radius r = 3σ from 1 to
-512 texels. Relative L1, L2 and maximum error against the binned reference, whose own noise is
-measured too, against time per query (random places, normals drawn from the P-NDF, one thread) and
-memory. Elements, lobes and filters have a roughness of their own, and are compared with a reference
-that is as rough. *Image level*: the curved patch against brute force at log-spaced numbers of
-samples, several seeds; footprints shrink with the number of samples, as ``glintbsdf render`` has
-it. All methods run in turn within every repetition; building and compiling are timed apart.
+*P-NDFs*: six procedural maps and given maps; round footprints of radius r = 3σ from 1 to 512
+texels. The relative L1, L2 and maximum error, against the binned reference and its noise, over time
+per query (random places, normals drawn from the P-NDF, one thread) and over memory. Elements, lobes
+and filters have an intrinsic roughness, and their reference has the same. *Images*: the curved
+patch against brute force, for log-spaced numbers of samples and several seeds. Footprints shrink
+with the number of samples, as in ``glintbsdf render``. All methods run in turn within every
+repetition; building and compiling are timed separately.
 
-The folder gets ``report.html``, one page with everything in it; the same as JSON and CSV;
-``which_when.csv``, the fastest method per map, footprint and error; and ``figures``.
+The folder gets ``report.html``, one page with everything; the same as JSON and CSV;
+``which_when.csv``, the fastest method for each map, footprint and error; and ``figures``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from glintbsdf.check.truth import Truth
 
 @dataclass(frozen=True)
 class Settings:
-    """How much is measured."""
+    """Settings of all measurements."""
 
     pndf: pndf.Settings
     images: images.Settings
@@ -70,7 +70,7 @@ FULL = Settings(
 
 
 class Measurement:
-    """The walk over all units, each of which is measured or found in the store."""
+    """All units of the report; each is measured, or found in the store."""
 
     def __init__(self, settings: Settings, cases: list[Case], methods: list[Method], store: Store):
         self.settings, self.store, self.cases = settings, store, cases
@@ -79,7 +79,7 @@ class Measurement:
         self.image_methods = [method for method in methods if method.image]
 
     def run(self, progress: Progress) -> dict:
-        """Everything that the report shows: lists of (values, arrays)."""
+        """All data of the report: lists of (values, arrays)."""
         s = self.settings
         total = len(self.image_cases) * len(s.images.scales) * (1 + len(s.images.budgets)) + 1
         total += len(self.cases) * len(s.pndf.radii)
@@ -97,7 +97,7 @@ class Measurement:
         return found
 
     def unit(self, label: str, key: dict, measure: Callable[[], tuple]) -> tuple:
-        """A unit from the store; ``measure`` is called where it has none."""
+        """A unit from the store; ``measure`` is called if it is not there."""
         self.progress.update(self.task, description=label)
         start = time.perf_counter()
         result = self.store.get(key, measure)
@@ -107,7 +107,7 @@ class Measurement:
         return result
 
     def pndf_case(self, case: Case, compiled: set[Method], found: dict) -> None:
-        """All methods on a map: building, then every footprint. ``compiled``: methods seen."""
+        """All methods on a map: building, then every footprint. ``compiled``: methods so far."""
         settings = self.settings.pndf
         surface = case.surface(settings.size)
         shared = {"map": surface.normal_map.content_hash, "epsilon": surface.epsilon}
@@ -120,7 +120,7 @@ class Measurement:
 
         def footprint(radius: float):
             for method in methods:
-                if method not in built:  # an earlier run has timed it
+                if method not in built:  # an earlier run has timed the build
                     built[method] = method.build(surface)
             return pndf.measure({m: built[m] for m in methods}, surface, radius, settings)
 
@@ -144,7 +144,7 @@ class Measurement:
         dr.flush_malloc_cache()
 
     def image_case(self, case: Case, scale: float, found: dict) -> None:
-        """All materials on a map: the truth, then every number of samples."""
+        """All materials on a map: the reference, then every number of samples."""
         settings = self.settings.images
         surface = case.surface(settings.map_size)
         methods = [method for method in self.image_methods if method.suits(case)]
@@ -184,9 +184,8 @@ class Measurement:
 def measure_all(
     settings: Settings, cases: list[Case], methods: list[Method], folder: Path, profile: str
 ) -> dict:
-    """Measure what is not measured yet, and write the report to ``folder``; returns its JSON."""
-    # Mitsuba never returns from reading an image where Dr.Jit has a single thread.
-    dr.set_thread_count(max(2, dr.thread_count()))
+    """Measure all that is not in the store, write the report to ``folder``, and return its JSON."""
+    dr.set_thread_count(max(2, dr.thread_count()))  # Mitsuba hangs with one
     store, console = open_store(folder), Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=console) as progress:
@@ -205,7 +204,7 @@ def measure_all(
 
 
 def compared(quick: bool, families: tuple[str, ...]) -> list[Method]:
-    """The methods of the report, those of ``families`` if any are named."""
+    """The methods of the report; only methods of ``families`` if any are named."""
     return [
         method
         for method in METHODS
@@ -219,7 +218,7 @@ FAMILIES = list(dict.fromkeys(m.family for m in METHODS if m.pndf or m.image))
 
 
 @click.command(help=__doc__, short_help=__doc__.splitlines()[0])
-@click.option("--quick", is_flag=True, help="In five minutes: fewer of everything.")
+@click.option("--quick", is_flag=True, help="Fewer and smaller cases, in five minutes.")
 @click.option("--map", "others", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
               help="A further map.")  # fmt: skip
 @click.option("--maps", multiple=True, type=click.Choice([case.name for case in CASES]),

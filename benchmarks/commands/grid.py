@@ -1,4 +1,4 @@
-"""glint_grid against the smooth surface that it is from afar, and against itself under motion."""
+"""glint_grid against the smooth surface that it looks like from afar, and under motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MATERIALS = {
 
 
 def smooth(alpha_u: float = 0.3, alpha_v: float = 0.3, **_: object) -> dict:
-    """Beckmann's ``roughconductor`` of the same roughness."""
+    """``roughconductor`` with a Beckmann distribution of the same roughness."""
     rough = {"type": "roughconductor", "distribution": "beckmann"}
     return rough | {"alpha_u": alpha_u, "alpha_v": alpha_v}
 
@@ -59,7 +59,7 @@ def relative_values(parameters: dict, count: int, extent: float, sigma: float) -
 
 def mean(parameters: dict, count: int) -> dict:
     """Means of red, green and blue, and their standard errors."""
-    # Cells of 3e-3 and 6e-3: over a million even along one axis, which is all that grooves have.
+    # Cells of 3e-3 and 6e-3: over a million even along one axis, as grooves have only one axis.
     values = relative_values({"density": 5.0, **parameters}, count, 1e4, 3e-3)
     row = {}
     for name, channel in zip(("red", "green", "blue"), values, strict=True):
@@ -68,10 +68,10 @@ def mean(parameters: dict, count: int) -> dict:
 
 
 def means(run: Run) -> None:
-    """Mean over 10⁶ places that share no cells, in units of Beckmann's ``roughconductor``.
+    """Mean over 10⁶ places without common cells, relative to ``roughconductor`` (Beckmann).
 
-    Expected: 1 within four standard errors and 0.35 %, the error of roughconductor's rational
-    masking function.
+    Expected: 1, within four standard errors and 0.35 %, which is the error of roughconductor's
+    rational approximation of the masking function.
     """
     with run.table("means") as table:
         for name, parameters in MATERIALS.items():
@@ -86,10 +86,10 @@ def deviation(density: int, count: int) -> dict:
 
 
 def deviations(run: Run) -> None:
-    """Standard deviation over places, relative to the mean, against density.
+    """Standard deviation over places, relative to the mean, for densities.
 
-    Expected: none of it larger than before; with many microdetails per pixel, a tenth for a hundred
-    times as many.
+    Expected: it falls with the density; with many microdetails per pixel, by a factor of ten for a
+    hundred times as many.
     """
     count = 10_000 if run.quick else 100_000
     with run.table("deviations") as table:
@@ -106,7 +106,7 @@ ANGLE = radians(20)  # of the long axis of a pixel
 
 
 class BlendedCells(CoveredCells):
-    """Both grids without coherence: each level is moved to a place of its own."""
+    """Both grids without coherence: each level is shifted by a different distance."""
 
     def sum(self, term, zero, active):
         def moved(x, y, level, active):
@@ -116,7 +116,7 @@ class BlendedCells(CoveredCells):
 
 
 class SingleCell(CoveredCells):
-    """The cell at the pixel's centre, on the grid whose cells are nearest to the pixel's size."""
+    """One cell: at the pixel's centre, in the grid whose cells are nearest to the pixel's size."""
 
     def sum(self, term, zero, active):
         level = dr.select(self.blend < 0.5, self.level, self.level + 1)
@@ -129,7 +129,7 @@ CELLS = {"coherent": CoveredCells, "blended": BlendedCells, "single": SingleCell
 
 
 def frame(grid: Grid, ratio: float, shift: float, zoom: float) -> np.ndarray:
-    """One picture: ``shift`` in pixels, ``zoom`` the size of a pixel relative to the first."""
+    """One image; ``shift`` is in pixels, ``zoom`` is the size of a pixel relative to the first."""
     pitch = 2.7e-4  # UV; at density 8 a microdetail is 1e-4 wide
     row, column = np.divmod(np.arange(SIZE * SIZE), SIZE)
     c, s = cos(ANGLE), sin(ANGLE)
@@ -146,7 +146,7 @@ def frame(grid: Grid, ratio: float, shift: float, zoom: float) -> np.ndarray:
 
 
 def moved(run: Run, ratio: float, motion: str, cells: str) -> dict:
-    """Differences of pixels between the frames of a motion."""
+    """Differences of pixels between successive frames of a motion."""
     count = 8 if run.quick else FRAMES
     path = {
         "pan": [(k / 8, 1.0) for k in range(count)],
@@ -170,15 +170,15 @@ def moved(run: Run, ratio: float, motion: str, cells: str) -> dict:
 
 
 def motion(run: Run) -> None:
-    """Stability of pictures under motion of the camera by fractions of a pixel (Zirr16, Fig. 5).
+    """Stability of images while the camera moves by fractions of a pixel (Zirr16, Fig. 5).
 
-    A plane, one query per pixel, with round pixels and pixels of 16:1, pans by an eighth of a pixel
-    per frame; or the camera recedes until pixels are 2.2 times as large, about points that stay, so
-    that every pixel changes its grids once. Printed is the mean absolute difference of a pixel
-    between frames, relative to that between pictures of independent microdetails (another seed);
-    "worst" is the largest of one frame to the next over the mean: near 1 without popping.
-    "coherent" are the plugin's grids; "blended" grids of two levels share nothing (Fig. 5, left);
-    "single" is one grid, the cell at the pixel's centre.
+    A plane has one query per pixel, with round pixels or pixels of 16:1. It pans by an eighth of a
+    pixel per frame; or pixels grow by a factor of 2.2 around fixed points, so that every pixel
+    changes its grids once. The table has the mean absolute difference of a pixel between frames,
+    relative to images with independent microdetails (another seed). "worst" is the largest
+    difference of successive frames, over the mean; it is near 1 without popping. "coherent" are the
+    plugin's grids; in "blended", the two grids have independent noise (Fig. 5, left); "single" is
+    the cell at the pixel's centre.
     """
     with run.table("motion") as table:
         for ratio in (1, 16):

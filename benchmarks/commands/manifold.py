@@ -1,6 +1,6 @@
-"""glint_manifold (Wu24): errors of its tables; pictures by tables, clusters, kernels and masking.
+"""glint_manifold (Wu24): errors of tables; images for tables, clusters, kernels and maskings.
 
-Errors, times and memory of a query by ``max_error`` and by τ are in ``error_vs_time``.
+``error_vs_time`` measures errors, times and memory of a query for values of ``max_error`` and τ.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from glintbsdf.pndf import TabulatedManifold
 
 NAMES = ("isotropic", "smooth", "brushed", "scratched", "flakes", "leather")
 
-#: Their smaller axes have radii r = 3σ of 16 to 512 texels.
+#: Footprints whose smaller axes have radii r = 3σ of 16 to 512 texels.
 ELLIPSES = (
     *(Ellipse.round(radius / 3) for radius in (16, 32, 64, 128, 256, 512)),
     Ellipse(128 / 3, 64 / 3, 30),
@@ -27,9 +27,9 @@ ELLIPSES = (
 
 
 def table_errors(pndf: TabulatedManifold, ellipse: Ellipse) -> dict:
-    """Level in use, predicted and measured error, their ratio, of the means and at the worst place.
+    """Level, mean predicted and measured error, and ratio of both: of the means, and the largest.
 
-    The level is −1 where the lists answer, exactly.
+    The level is −1 where evaluation is exact.
     """
     predicted, measured = [], []
     for place in ((0.47, 0.52), (0.13, 0.77), (0.86, 0.31)):
@@ -49,10 +49,10 @@ def table_errors(pndf: TabulatedManifold, ellipse: Ellipse) -> dict:
 
 
 def tables(run: Run) -> None:
-    """Errors of tables of ``max_error`` 0.05, predicted and measured, for all kernels.
+    """Predicted and measured errors of tables with ``max_error`` 0.05, for all kernels.
 
-    The measured ones are on the tables' bins, without sampling noise, and averaged over places.
-    Expected: between a half and the whole of the predicted ones.
+    Measured errors are those of the masses in the tables' bins, without sampling noise, averaged
+    over places. Expected: a measured error is between half of the predicted one and the whole.
     """
     size, names = (512, NAMES[:1]) if run.quick else (1024, NAMES)
     with run.table("tables") as table:
@@ -66,18 +66,18 @@ def tables(run: Run) -> None:
 
 
 # --------------------------------------------------------------------------------------------------
-#  Pictures
+#  Images
 # --------------------------------------------------------------------------------------------------
 
 
 def compare(
     run: Run, part: str, name: str, radius: float, settings: dict[str, dict], noise: int = 0
 ) -> None:
-    """Pictures of the curved patch by setting: differences from the first one's, and times.
+    """Images of the curved patch for each setting: differences from the first setting, and times.
 
-    ``name`` is that of the map, and ``radius`` that of footprints, texels. Pictures are clipped to
-    [0, 1], what a screen shows: the brightest glints would outweigh all else in a mean square. The
-    first one's is rendered once more with a seed that is ``noise`` larger, for the differences.
+    ``name`` is the name of the map, ``radius`` the radius of footprints, texels. Images are clipped
+    to [0, 1], as on a screen; otherwise the brightest glints would dominate a mean square. The seed
+    of the reference, which has the first setting, is larger by ``noise``.
     """
     size, spp = (96, 16) if run.quick else (192, 64)
     shared = cache(lambda: shared_by_all(name, radius, 512 if run.quick else 1024))
@@ -103,7 +103,7 @@ def compare(
 
 
 def shared_by_all(name: str, radius: float, texels: int) -> dict:
-    """The material of all pictures of a comparison, but for the setting."""
+    """The material of all images of a comparison, without the setting."""
     return {
         "type": "glint_manifold",
         "data": mi.TensorXf(MAPS[name](texels).normals),
@@ -115,10 +115,10 @@ def shared_by_all(name: str, radius: float, texels: int) -> dict:
 
 
 def renders(run: Run) -> None:
-    """Scratches by clusters and by tables, 64² texels a footprint (Fig. 15, Table 3).
+    """Scratches by clusters and by tables, with 64² texels per footprint (Fig. 15, Table 3).
 
-    The row "exact" is the noise. Expected: errors grow with τ, as in the paper; those of tables
-    stay within the noise.
+    The row "exact" is the noise. Expected: errors of clusters grow with τ, as in the paper; errors
+    of tables are within the noise.
     """
     settings = {"exact": {}} | {f"τ = {t:g}": {"threshold": t} for t in (0.01, 0.1, 1.0, 10.0)}
     settings |= {f"max_error = {e:g}": {"max_error": e} for e in (0.02, 0.05, 0.2)}
@@ -126,18 +126,18 @@ def renders(run: Run) -> None:
 
 
 def kernels(run: Run) -> None:
-    """The isotropic map by the Gaussian of 128² texels, the disk and the box, of 64² (Fig. 16).
+    """The isotropic map with the Gaussian of 128² texels, the disk and the box of 64² (Fig. 16).
 
-    Expected: half the time; the same look.
+    Expected: disk and box look the same, and take half of the time.
     """
     settings = {kernel: {"kernel": kernel} for kernel in KERNELS}
     compare(run, "kernels", "isotropic", 64, settings)
 
 
 def masking(run: Run) -> None:
-    """Each masking beside the analytic one (Fig. 12).
+    """Each masking against the analytic one (Fig. 12).
 
-    Expected: the fit within 1 %, at a tenth of the time.
+    Expected: the fit differs by less than 1 %, and takes a tenth of the time.
     """
     settings = {m: {"masking": m} for m in ("analytic", "ggx_fit", "beckmann", "none")}
     compare(run, "masking", "isotropic", 4, settings)

@@ -1,12 +1,12 @@
-"""glint_mip's lobes against the map that its look-up table implies (Tan22); the map's seams.
+"""Lobes of glint_mip against the explicit map (Tan22), and the seams of this map.
 
-The samples are our own, of 256² texels, made 2048². The reference is ``glint_elements`` with
-elements half a texel apart on the explicit map, as in the paper. Footprints are round and w = 2σ
-texels wide. Errors are relative L1 differences on a grid of 128² normals over the range of the
-map's, mean of three places, σ_r = 0.005. Times are those of random queries on one thread.
+The samples have 256² texels, the maps 2048². The reference is ``glint_elements`` with elements half
+a texel apart on the explicit map, as in the paper. Footprints are round and w = 2σ texels wide.
+Errors are relative L1 differences on a grid of 128² normals over the range of the map's normals,
+with σ_r = 0.005, and means over three places. Times are for random queries on one thread.
 
-Storage and time of building are in ``cost building``, errors by C_P and against the binned P-NDF in
-``error_vs_time``, with pictures.
+``cost building`` measures memory and time of building; ``error_vs_time`` measures errors for values
+of C_P, and against the binned P-NDF, with images.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from glintbsdf.maps.quilting import lobe_features, synthesise
 from glintbsdf.pndf import Elements, Mip
 
 WIDTHS = (8, 16, 32, 64, 128, 256, 512)
-#: Wider footprints would keep the reference busy for minutes.
+#: The reference would take minutes for wider footprints.
 WIDEST_REFERENCE = 128
 RES = 128
 
@@ -53,12 +53,12 @@ class NearestLevel(Mip):
 
 
 def samples_of(run: Run) -> dict[str, Callable[[], NormalMap]]:
-    """The samples that maps are made of."""
+    """The samples to make maps from."""
     return maps_of(run, 256, *("isotropic", "scratched")[: 1 if run.quick else 2], seed=3)
 
 
 def structures(make: Callable[[], NormalMap], size: int, settings: dict[str, dict]) -> dict:
-    """The elements of the explicit map first, and lobes by setting."""
+    """The elements of the explicit map, then the lobes for each setting."""
     shared = {"output_size": size, "sigma_r": SIGMA_R}
     lobes = {name: Mip(make(), **shared, **options) for name, options in settings.items()}
     explicit = next(iter(lobes.values())).normal_map
@@ -66,7 +66,7 @@ def structures(make: Callable[[], NormalMap], size: int, settings: dict[str, dic
 
 
 def all_normals(normal_map: NormalMap) -> mi.Vector2f:
-    """The grid of normals over the range of the map's."""
+    """A grid of normals over the range of the map's normals."""
     normals = normal_map.normals.reshape(-1, 2)
     return grid_of_normals((normals.min(axis=0), normals.max(axis=0)), RES)
 
@@ -109,7 +109,7 @@ def compared(build: Structures, width: float, repetitions: int) -> list[dict]:
 
 
 def clusters(run: Run) -> None:
-    """Error, time and memory over footprints by the number of lobes, k (Fig. 13)."""
+    """Error, time and memory for footprints and numbers k of lobes (Fig. 13)."""
     settings = {f"k = {k}": {"clusters": k} for k in (16, 32, 64)}
     size = 1024 if run.quick else 2048
     with run.table("clusters") as table:
@@ -133,8 +133,8 @@ def largest_jump(pndf: Mip, widest: float) -> dict:
 def interpolation(run: Run) -> None:
     """The largest change of the P-NDF while the footprint grows by 1 % (Fig. 14).
 
-    With two levels blended, and with the nearest one alone. Expected: without interpolation, jumps
-    of as much as the error, 0.2; with it, below 0.02.
+    Two levels are blended, or only the nearest one is used. Expected: jumps as large as the error,
+    0.2, without interpolation, and below 0.02 with it.
     """
     size, widest = (1024, 32) if run.quick else (2048, 128)
     with run.table("interpolation") as table:
@@ -153,7 +153,7 @@ def interpolation(run: Run) -> None:
 
 
 def seam(run: Run, make: Callable[[], NormalMap], sample: str, patch: int, overlap: int) -> dict:
-    """Roughness across overlaps and cuts over that inside, and repetition."""
+    """Roughness across overlaps and cuts, relative to the inside of patches; and repetition."""
     size, given = 512 if run.quick else 1024, make()
     synthesis = synthesise(given, size, patch, overlap)
     normals = synthesis.explicit()
@@ -188,7 +188,7 @@ def seam(run: Run, make: Callable[[], NormalMap], sample: str, patch: int, overl
 
 
 def repetition(normals: np.ndarray, patch: int) -> float:
-    """The highest autocorrelation of a map at distances from half a patch to four patches."""
+    """The largest autocorrelation of a map at distances from half a patch to four patches."""
     spectrum = np.fft.rfft2(normals - normals.mean(axis=(0, 1)), axes=(0, 1))
     correlation = np.fft.irfft2((np.abs(spectrum) ** 2).sum(axis=2), s=normals.shape[:2])
     shift = np.minimum(np.arange(len(normals)), len(normals) - np.arange(len(normals)))
@@ -198,12 +198,12 @@ def repetition(normals: np.ndarray, patch: int) -> float:
 
 
 def seams(run: Run) -> None:
-    """Seams of maps that are made of patches, and how much of a map repeats.
+    """Seams of maps that are made of patches, and their repetition.
 
-    The squared difference (Eq. 7) of neighbouring texels in the overlaps over that inside of
-    patches, mean and 99th percentile; and that of the texels on either side of a cut. Repetition is
-    the autocorrelation of normals at its highest, half a patch to four patches away;
-    ``most_frequent`` is the largest share of cells that show the same patch.
+    The table has the squared difference (Eq. 7) of neighbouring texels in overlaps, relative to the
+    inside of patches (mean and 99th percentile), and the same for texels on either side of a cut.
+    ``repetition`` is the largest autocorrelation of normals at distances from half a patch to four
+    patches; ``most_frequent`` is the largest share of cells with the same patch.
     """
     samples = maps_of(run, 256, "isotropic", "leather", "brushed", "scratched", "flakes", seed=3)
     samples["noise"] = partial(white_noise, (256, 256))

@@ -26,7 +26,7 @@ from glintbsdf.scene.rendering import pixel_angle
 
 
 def monte_carlo(mesh: TexelMesh, footprint: Footprint, w: np.ndarray, side: int) -> np.ndarray:
-    """P of one footprint for directions (3, N), by jittered points of the kernel, in float64."""
+    """P(ω) of one footprint for directions (3, N), by jittered points of the kernel, in float64."""
     jitter = np.random.default_rng(1).random((2, side, side))
     u = np.float32((jitter + np.mgrid[:side, :side]) / side).reshape(2, -1)
     kernel = mesh.texel_kernel(footprint)
@@ -37,7 +37,7 @@ def monte_carlo(mesh: TexelMesh, footprint: Footprint, w: np.ndarray, side: int)
 
 
 def area_errors(make: Callable[[], NormalMap], sigma: float, quick: bool) -> dict:
-    """Errors of P under random round footprints of ``sigma`` texels."""
+    """Errors of P(ω) under random round footprints of ``sigma`` texels."""
     side, samples, places = (12, 128, 1) if quick else (24, 256, 3)
     normal_map = make()
     y, x = 2 * (np.mgrid[:side, :side] + 0.5) / side - 1
@@ -69,10 +69,10 @@ def area_errors(make: Callable[[], NormalMap], sigma: float, quick: bool) -> dic
 
 
 def areas(run: Run) -> None:
-    """Root mean square error of P(ω) over the hemisphere against Monte Carlo (Fig. 8).
+    """Root mean square error of P(ω) over the hemisphere, against Monte Carlo (Fig. 8).
 
-    The analytic sum for the Gaussian and the box kernel, and the GGX fit, with microseconds per
-    query. Expected: 0.002 and 0.005, the fit worst at grazing angles.
+    It compares the analytic sum for the Gaussian and the box kernel, and the GGX fit, with
+    microseconds per query. Expected: 0.002 and 0.005; the fit is worst at grazing angles.
     """
     with run.table("areas") as table:
         for name, make in maps_of(run, 512, "isotropic", "brushed", "scratched").items():
@@ -87,18 +87,18 @@ def areas(run: Run) -> None:
 
 
 def directions_to_the_horizon(rng, count: int) -> np.ndarray:
-    """Unit vectors (3, N), a third uniform in their height, the others down to 1e-4."""
+    """Unit vectors (3, N): a third is uniform in z, the others are log-uniform down to 1e-4."""
     z = np.where(rng.random(count) < 0.3, rng.random(count), 10 ** rng.uniform(-4, 0, count))
     phi, r = 2 * np.pi * rng.random(count), np.sqrt(1 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z])
 
 
 def furnace(run: Run) -> None:
-    """What the facets reflect of uniform light, by stratified points of the footprint.
+    """The share of uniform light that facets reflect, by stratified points of the footprint.
 
-    With the masking of each estimate of P, height-correlated or separable: the largest energy of
-    random places and directions, less three standard errors, and the share above 1.002. Expected:
-    1; measured: 1.0015, of grooves seen through a hundredth of a texel.
+    For the masking by each estimate of P, height-correlated or separable: the largest energy over
+    random places and directions, minus three standard errors, and the share above 1.002. Expected:
+    1; measured: 1.0015, for grooves under a footprint of a hundredth of a texel.
     """
     names = ("isotropic", "brushed", "scratched", "leather", "flakes", "rough", "flat")
     sigmas = (0.01, 0.3, 1, 4) if run.quick else (0.01, 0.1, 0.3, 0.6, 1, 1.4, 2, 4, 8, 16)
@@ -120,7 +120,7 @@ def furnace(run: Run) -> None:
 
 
 def energies(mesh: TexelMesh, masking: ProjectedAreaMasking, sigma: float, quick: bool) -> dict:
-    """Reflected shares of uniform light for random views and places; ``sigma`` in texels."""
+    """Reflected shares of uniform light for random views and places; ``sigma`` is in texels."""
     count, side = (200, 16) if quick else (1000, 24)
     sigma /= mesh.normal_map.width
     rng = np.random.default_rng(4)
@@ -155,7 +155,7 @@ def energies(mesh: TexelMesh, masking: ProjectedAreaMasking, sigma: float, quick
 
 
 def diffuse_plane(bsdf: dict, size: int) -> mi.Scene:
-    """A plane that fills the picture, seen obliquely."""
+    """A plane that fills the image, seen obliquely."""
     wide = mi.ScalarTransform4f().scale([10, 10, 1])
     sun = {"type": "directional", "irradiance": 3.0, "direction": [0.8, 0.3, -0.5]}
     shape = {"type": "rectangle", "to_world": wide, "bsdf": bsdf}
@@ -163,7 +163,7 @@ def diffuse_plane(bsdf: dict, size: int) -> mi.Scene:
 
 
 def diffuse_errors(scale: float, size: int, many: int, run: Run) -> list[dict]:
-    """Errors at 1 and 64 samples per pixel, from ``many`` of the same and of ``normalmap``."""
+    """Errors at 1 and 64 samples per pixel, against ``many`` of the same and of ``normalmap``."""
     normal_map, to_uv = MAPS["rough"](256), scaled(scale)
     n = normal_map.normals.astype(np.float64)
     xyz = np.concatenate([n, np.sqrt(1 - (n**2).sum(2, keepdims=True))], 2)
@@ -205,12 +205,11 @@ def diffuse_errors(scale: float, size: int, many: int, run: Run) -> list[dict]:
 def diffuse(run: Run) -> None:
     """A rough diffuse plane under a directional light, whose only noise is aliasing (Fig. 14).
 
-    The map repeats so often that a pixel in the middle sees 6 or 25 texels: one facet's width, and
-    four times that. Error at few samples per pixel against many, relative to the mean, of
-    ``diffuse`` in ``normalmap`` and of ``glint_diffuse``. The reference of ``glint_diffuse`` is its
-    own with footprints of points, as it converges to facets that count with their own area.
-
-    Expected: a tenth of the aliasing at 1 sample per pixel.
+    The map repeats so often that a pixel in the middle covers 6 or 25 texels: the width of a bump,
+    and four times this width. The table has the errors of ``diffuse`` in ``normalmap`` and of
+    ``glint_diffuse``, relative to the mean, against many samples. The reference of
+    ``glint_diffuse`` is its own image with point footprints, as its facets count with their own
+    area. Expected: a tenth of the aliasing at 1 sample per pixel.
     """
     size, many = (48, 512) if run.quick else (96, 4096)
     with run.table("diffuse") as table:

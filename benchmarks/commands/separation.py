@@ -1,15 +1,14 @@
-"""What separated illumination costs and saves, and what denoising its indirect part saves.
+"""Cost and gain of separated illumination, and of denoising its indirect part.
 
-The scene is interreflection.xml, where glints meet glints, with two maps: behind a rough bounce
-footprints are wide, and hold the more texels the finer the map. Their cost is bounded by
-``max_error`` 0.1; exact, the coarse map takes hundreds of times as long with ``separate`` off.
+The scene is interreflection.xml, where light meets glints several times, with two maps. Behind a
+rough bounce footprints are wide; the finer the map, the more texels they cover. ``max_error`` 0.1
+bounds their cost.
 
-``glint_path`` renders each with ``separate`` off and on, in turn; the figures are the median time
-and the median of the ratio within the same repetition, after a first frame that compiles. Errors
-are mean absolute differences of an image from the mean of 32 images of the same kind, the limit,
-relative to the mean of those: how far each is from what it converges to. What it converges to with
-``separate`` on differs from that with ``separate`` off as far as smooth lobes differ from glints in
-indirect light; that is printed too, with the part of it that noise makes up.
+``glint_path`` renders each scene with ``separate`` off and on, in turn. The table has the median
+time, and the median ratio within a repetition, after a first frame that compiles. An error is the
+mean absolute difference of an image from its limit, relative to the mean; the limit is the mean of
+32 images of the same kind. The limits with ``separate`` on and off differ, as smooth lobes differ
+from glints in indirect light; the table has this difference, and the part of it that is noise.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ SCENES = {
 
 
 def image(scene: mi.Scene, separate: bool, spp: int, seed: int) -> mi.TensorXf:
-    """Red, green and blue, and with ``separate`` those of direct and indirect light."""
+    """The image, with ``separate`` also its direct and indirect light."""
     integrator = scene.integrator()
     integrator.separate = separate
     return integrator.render(scene, scene.sensors()[0], seed=seed, spp=spp)
@@ -44,7 +43,7 @@ def error(images: np.ndarray, reference: np.ndarray, level: float) -> float:
 
 
 def measure(parameters: dict[str, str], spp: int, count: int) -> dict[str, float]:
-    """All figures of one scene."""
+    """The row of one scene."""
     scene = load_scene(SCENE, {"spp": str(spp), **parameters})
     images = {False: [], True: []}
 

@@ -1,12 +1,12 @@
-"""Numerical stability of every method on stiff and extreme cases: one table of broken bounds.
+"""Numerical stability of every method in stiff and extreme cases: a table of bounds.
 
-Every method meets every stiff map, from flat to white noise up to the disk's rim and down to a
-single texel, and its own stiff parameter over eight decades. A row of the table is one method on
-one map; docs/reports/stability.rst explains the columns and their bounds.
+Every method is tested on every stiff map, from flat maps to white noise over the whole disk, and
+down to a single texel; and with its stiff parameter over eight decades. A row of the table is one
+method on one map; docs/reports/stability.rst explains the columns and their bounds.
 
-Errors of estimates count as often as makes the significance of the whole table 0.01. Lobes that are
-narrower than a hundred times the error of a half vector are asked for numbers that are finite and
-not negative, and for no more: what is in parentheses is not judged.
+The significance of all statistical tests of the table together is 0.01. Lobes that are narrower
+than a hundred times the error of a half vector must only be finite and not negative; their other
+figures are in parentheses and not judged.
 
 The table is printed, and written to the folder as ``stability.json``, ``stability.csv`` and
 ``stability.html``. The exit status is 1 if a bound is broken.
@@ -45,13 +45,13 @@ from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.scene.rendering import replacing
 
-#: Parameters are swept on the first maps, pictures made on the second; in a hurry only these count.
+#: Maps for sweeps of parameters, and maps for images; ``--quick`` uses these only.
 SWEPT, STIFFEST = ("step edge", *NO_MAP), ("white noise", *NO_MAP)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method on one map, with one parameter changed or none."""
+    """One method on one map, with at most one parameter changed."""
 
     method: str
     map: str
@@ -66,7 +66,7 @@ class Row:
         )
 
     def description(self) -> dict:
-        """For ``mi.load_dict``; footprints of a query without UV partials are cones."""
+        """The dictionary for ``mi.load_dict``; without UV partials, footprints are cones."""
         method = STIFF[self.method]
         description = {
             "type": method.plugin,
@@ -107,7 +107,7 @@ def is_first(name: str) -> bool:
 
 
 def measure(row: Row) -> dict:
-    """Everything that is measured of a row, by name; ``errors`` holds messages of what failed."""
+    """All figures of a row, by name; ``errors`` has the messages of failed ones."""
     method, description = STIFF[row.method], row.description()
 
     def load() -> mi.BSDF:
@@ -152,15 +152,15 @@ def measure(row: Row) -> dict:
 
 
 def in_a_line(error: Exception) -> str:
-    """What an error says: Mitsuba quotes all of Python's traceback, whose last line it is."""
+    """The message of an error; in Mitsuba's errors, it is the last line of Python's traceback."""
     lines = [line.strip() for line in f"{type(error).__name__}: {error}".splitlines()]
     return next((line for line in reversed(lines) if "Error: " in line), lines[0])
 
 
 def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
-    """Texels, flakes or finest cells per unit of UV, and how far apart places are to lie.
+    """Texels, flakes or finest cells per unit of UV, and the distance over which to spread places.
 
-    Only on average over places does ``glint_grid`` keep the energy.
+    ``glint_grid`` keeps the energy only on average over places.
     """
     method = STIFF[row.method]
     if method.plugin == "glint_grid":
@@ -172,13 +172,13 @@ def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
 
 
 def promised(method: Stiff, views: list[View]) -> list[View]:
-    """The views from which the method keeps the energy."""
+    """The views from which the method must keep the energy."""
     if method.furnace == VERTICAL:
         return [view for view in views if view.wi[2] == 1]
     return views
 
 
-#: Oren and Nayar's model reflects at most this share of uniform light, along the horizon: the
+#: Largest share of uniform light that Oren and Nayar's model reflects, along the horizon: the
 #: maximum of A + B/2 over roughness.
 OREN_NAYAR = 1.0152
 
@@ -201,13 +201,13 @@ def energy_limit(row: Row) -> float:
 
 SIGNIFICANCE = 0.01
 MASS_BOUND, DOUBLE_BOUND, BRIGHT_BOUND = 1e-3, 1e-3, 1e-5
-LAST_DIGITS = 4  # of the input, that rounding may amount to
-UNRESOLVED = 0.01  # an integral of a larger error says nothing
+LAST_DIGITS = 4  # rounding may change a value as much as this many last digits of the input
+UNRESOLVED = 0.01  # an integral with a larger error is not judged as good
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One figure of the table; ``text`` is empty where the column does not apply."""
+    """One figure of the table; ``text`` is empty if the column does not apply."""
 
     text: str = ""
     broken: bool = False
@@ -215,7 +215,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Judge:
-    """Bounds for a table of ``tests`` statistical tests of a kind."""
+    """The bounds, for a table with ``tests`` statistical tests of a kind."""
 
     tests: int
 
@@ -226,7 +226,7 @@ class Judge:
 
     @property
     def sigmas(self) -> float:
-        """Standard errors that an estimate may be off."""
+        """Number of standard errors by which an estimate may be wrong."""
         return float(scipy.stats.norm.isf(self.smallest_p / 2))
 
     def bounds(self) -> dict[str, str]:
@@ -243,7 +243,7 @@ class Judge:
         }
 
     def cells(self, result: dict) -> dict[str, Cell]:
-        """The columns of a measured row; those that do not apply are empty."""
+        """The columns of a measured row; columns that do not apply are empty."""
         verdicts = {
             "NaN": ("extremes", self.nan),
             "negative": ("extremes", self.negative),
@@ -272,7 +272,7 @@ class Judge:
         return Cell(str(result["extremes"]["negative"]), result["extremes"]["negative"] > 0)
 
     def mass(self, result: dict) -> Cell:
-        """The integral that is farthest beyond its error."""
+        """The integral that exceeds its error the most."""
         masses = [*result["densities"], *result.get("mean", [])]
         worst = max(masses, key=lambda d: self.beyond(abs(d["mass"]), d["mass_error"]))
         value, error = worst["mass"], worst["mass_error"]
@@ -288,7 +288,7 @@ class Judge:
         return Cell(f"{smallest:.2g}", not smallest >= self.smallest_p)
 
     def furnace(self, result: dict) -> Cell:
-        """The energy that is farthest beyond its error."""
+        """The energy that exceeds its error the most."""
         worst = max(result["energies"], key=lambda e: self.beyond(e["energy"], e["error"]))
         kept = self.beyond(worst["energy"], worst["error"]) <= result["energy_limit"] + MASS_BOUND
         limit = result["energy_limit"]
@@ -301,13 +301,13 @@ class Judge:
         return Cell(f"{bright['apart']:.1e}", not kept)
 
     def beyond(self, value: float, error: float) -> float:
-        """What noise does not explain of a value; NaN stays the largest."""
+        """The part of a value that noise does not explain; NaN counts as infinite."""
         value = value - self.sigmas * error
         return value if np.isfinite(value) else np.inf
 
 
 def test_count(rows: list[Row]) -> int:
-    """Statistical tests in a table, of the kind there are most of."""
+    """The number of statistical tests in a table, of the most frequent kind."""
     return max(
         sum(len(robustness.views(STIFF_SIZE, row.quick, STIFF[row.method].large)) for row in rows),
         sum(len(promised(STIFF[row.method], robustness.energy_views(STIFF_SIZE))) for row in rows),
@@ -334,7 +334,7 @@ def rich_table(finished: Finished, judge: Judge) -> Table:
 
 
 def messages(finished: Finished) -> list[str]:
-    """What went wrong, a line for each measure of a row."""
+    """The errors, one line each."""
     return [
         f"{row.name}: {name}: {message}"
         for row, result in finished
@@ -347,7 +347,7 @@ def labels(row: Row) -> tuple[str, str, str]:
 
 
 def write_reports(folder: Path, finished: Finished, judge: Judge) -> None:
-    """Write JSON, CSV and HTML; each file appears whole or not at all."""
+    """Write JSON, CSV and HTML; each file is complete or does not exist."""
     header = {
         "machine": machine(__file__),
         "bounds": judge.bounds(),
@@ -382,7 +382,7 @@ def write_reports(folder: Path, finished: Finished, judge: Judge) -> None:
 
 
 def finish(row: Row, store: Store) -> dict:
-    """Measure a row, or take it from an earlier run. An error is a result, Ctrl-C is not."""
+    """Measure a row, or take it from the store. An error is a result, Ctrl-C is not."""
 
     def measured() -> tuple[dict, dict]:
         start = time.perf_counter()
@@ -416,8 +416,8 @@ def run(rows: list[Row], folder: Path, console: Console) -> int:
 
 
 @click.command(help=__doc__, short_help=__doc__.splitlines()[0])
-@click.option("--quick", is_flag=True, help="The stiffest maps alone, in two minutes.")
-@click.option("--only", metavar="TEXT", default="", help="Rows whose name holds this.")
+@click.option("--quick", is_flag=True, help="Only the stiffest maps, in two minutes.")
+@click.option("--only", metavar="TEXT", default="", help="Only rows whose name has this.")
 def stability(quick: bool, only: str, output: Path, variant: str) -> int:
     mi.set_variant(variant)
     rows = [row for row in plan(quick) if only in row.name]

@@ -1,10 +1,9 @@
-"""``glint_grid`` has no map. It is compared with its own mean, and with itself, approximated less.
+"""Errors of ``glint_grid``, which has no map: it is compared with its mean, and with itself.
 
-Its details are random by definition, so that no picture of theirs is more right than another. What
-its ladder of ``max_anisotropy`` trades is contrast: a footprint more stretched than that is
-widened, and more details average out. The error is the relative loss of contrast (standard
-deviation over places, over the mean) against the largest ratio; the mean must stay that of the
-smooth surface.
+Its details are random by definition, so there is no correct image of them. But its
+``max_anisotropy`` costs contrast: a footprint that is more stretched is widened, and more details
+average out. The error is the loss of contrast (standard deviation over places, over the mean)
+relative to the largest ratio. The mean must be equal to the smooth surface.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ LADDER = (1.0, 4.0, 16.0, 64.0)
 #: The density is log10 of details per unit UV area; σ is the footprint's across, in UV.
 DENSITY, SIGMA = 5.0, 2e-3
 
-#: Places are drawn from a square of this side, in UV, so that few of their footprints meet.
+#: Places are drawn from a square of this side, in UV, so that few of their footprints overlap.
 EXTENT = 1e3
 
 ALPHA = 0.3
@@ -37,14 +36,14 @@ ALPHA = 0.3
 
 @dataclass(frozen=True)
 class Settings:
-    """Mean and contrast are taken over ``places`` independent places."""
+    """Mean and contrast are over ``places`` independent places."""
 
     places: int
     repetitions: int
 
 
 def measure(settings: Settings):
-    """Return mean, contrast and time of every rung, as a unit of the store."""
+    """Return mean, contrast and time for every ``max_anisotropy``, as a unit of the store."""
     u, v, turn = np.random.default_rng(1).random((3, settings.places))
     axis = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)])
     across = np.stack([-axis[1], axis[0]])
@@ -60,7 +59,7 @@ def measure(settings: Settings):
     rungs = {
         ratio: Grid(alpha=(ALPHA, ALPHA), density=DENSITY, max_anisotropy=ratio) for ratio in LADDER
     }
-    # The first round compiles, and tells the values.
+    # The first round compiles, and gives the values.
     values = {
         ratio: (pndf.eval(m, footprint) / smooth).numpy().astype(np.float64)
         for ratio, pndf in rungs.items()

@@ -1,4 +1,4 @@
-"""The image level: error against the brute-force truth, at equal numbers of samples and times."""
+"""Errors of images against a brute-force reference, at equal numbers of samples and times."""
 
 from __future__ import annotations
 
@@ -21,27 +21,26 @@ from benchmarks.methods import BASELINES, Method
 from glintbsdf.check.truth import Truth, reference_render
 from glintbsdf.scene.rendering import pixel_angle
 
-#: The lights get this radius, as brute force finds the scene's own too seldom.
+#: Radius of the lights; brute force finds the scene's smaller ones too rarely.
 LIGHT_RADIUS = 0.07
 
-#: Within so many degrees the patch fills the picture, and lights are seen in it alone.
+#: Field of view, degrees: the patch fills the image, and lights are visible in it only.
 FIELD_OF_VIEW = 30.0
 
-#: A box of one pixel has this standard deviation, so footprints vary as the truth's pixels do.
+#: Standard deviation of a box of one pixel, so that footprints have the variance of pixels.
 FOOTPRINT_SIGMA = 12**-0.5
 
-
-#: A process has so many seconds to end by itself.
+#: Seconds that a process gets to end by itself.
 PATIENCE = 20
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the image level is measured.
+    """Settings of the comparison of images.
 
-    ``maps`` are the names of the cases; maps from files are always taken. ``scales`` say how often
-    the map repeats on the patch, and so how many texels a pixel sees. ``budgets`` are samples per
-    pixel; every one is rendered with ``seeds`` seeds.
+    ``maps`` are the names of the cases; maps from files are always compared. ``scales`` are the
+    repetitions of the map on the patch, which determine the texels per pixel. ``budgets`` are
+    samples per pixel; each is rendered with ``seeds`` seeds.
     """
 
     map_size: int
@@ -56,8 +55,8 @@ class Settings:
 class Renderer:
     """A process with the scene of one material.
 
-    Dr.Jit traces every BSDF that lives in a process into every kernel, so that several scenes in
-    one would be compiled into each other; and each build and first frame is that of a user.
+    Dr.Jit traces every BSDF that exists in a process into every kernel, so scenes need separate
+    processes. Also, each build and first frame then takes as long as for a user.
 
     Attributes:
         building, first_frame (float): seconds; the first frame has one sample per pixel, and
@@ -79,7 +78,7 @@ class Renderer:
             raise RuntimeError("a process that renders has failed, see above") from None
 
     def render(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
-        """An image with footprints of ``spp`` samples per pixel, and the seconds it took."""
+        """An image with footprints for ``spp`` samples per pixel, and its seconds."""
         self.connection.send((spp, seed))
         return self.receive()
 
@@ -92,9 +91,9 @@ class Renderer:
 
 
 def serve(connection, variant: str, *arguments: object) -> None:
-    """What the process of a :class:`Renderer` does until the other end of the connection closes.
+    """The loop of a :class:`Renderer`'s process, until the other end of the connection closes.
 
-    ``arguments``: of :func:`load`.
+    ``arguments`` are arguments of :func:`load`.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     mi.set_variant(variant)
@@ -122,7 +121,7 @@ def load(material: Method | str, surface: Surface, scale: float, settings: Setti
 def renderers(
     methods: list[Method], surface: Surface, scale: float, settings: Settings
 ) -> Iterator[dict[str, Renderer]]:
-    """A :class:`Renderer` per material, by name, made one after the other; ends their processes."""
+    """A context with a :class:`Renderer` for each material, by name; it ends their processes."""
     materials = {name: name for name in BASELINES} | {method.name: method for method in methods}
     made: dict[str, Renderer] = {}
     try:

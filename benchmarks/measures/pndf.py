@@ -20,30 +20,30 @@ from glintbsdf import Footprint
 from glintbsdf.check import suite
 from glintbsdf.check.reference import BinnedPNDF, binned_pndf, normal_bounds
 
-#: A method with a roughness of its own has no clamp of the Jacobian; its reference has this one.
+#: Clamp of the Jacobian in the reference for methods that have a roughness instead of a clamp.
 UNCLAMPED = 1e-6
 
-#: A call with the few queries takes little more than its tracing; a batch has the most at most.
+#: A call with FEW queries takes little more than its tracing. A batch has at most MOST queries.
 FEW, MOST = 64, 2**18
 
-#: A query counts for at least so many seconds, as noise may leave nothing of its time where a
-#: call takes no longer than its tracing.
+#: Smallest time of a query, seconds, as noise may exceed the time of a call that takes no longer
+#: than its tracing.
 LEAST = 1e-9
 
-#: A bin's mean is taken from so many independent sets of points, whose spread tells its noise.
+#: Number of independent sets of points for a bin's mean; their differences give its noise.
 SETS = 4
 
-#: A set has at most so many points per bin and axis.
+#: Largest number of points per bin and axis in a set.
 MOST_POINTS = 24
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the P-NDF level of the report is measured.
+    """Settings of the comparison of P-NDFs.
 
-    ``radii`` are 3σ of round footprints, texels; ``samples`` those of one reference; ``points``
-    the most at which a density is averaged over bins, in ``patience`` seconds, if they took as long
-    as random queries in one thread, which they do not; ``batch`` the seconds of a timed batch.
+    ``radii`` are 3σ of round footprints, texels; ``samples`` is the number of samples of a
+    reference. ``points`` is the largest number of points for averages over bins; fewer are used if
+    they would take more than ``patience`` seconds. ``batch`` is the time of a timed batch, seconds.
     """
 
     size: int
@@ -58,11 +58,10 @@ class Settings:
 
 
 def structure(method: Method, surface: Surface, with_compiling: bool) -> tuple:
-    """The estimator, and the seconds to build it, its memory, and the seconds to compile it.
+    """The P-NDF, and the seconds to build it, its memory, and the seconds to compile it.
 
-    Nothing comes from the cache on disk. Compiling, of the code that builds and of that of the
-    first query, is what takes longer the first time, with Dr.Jit's own cache emptied; None where
-    it is not asked for, as it hardly depends on the map.
+    Caches on disk are not used. The time to compile is the additional time of a first build and
+    query with Dr.Jit's cache empty. It hardly depends on the map; None without ``with_compiling``.
     """
     m, footprint = queries(surface.normal_map, Ellipse.round(16 / 3), FEW, surface.epsilon)
     compiling = None
@@ -79,7 +78,7 @@ def structure(method: Method, surface: Surface, with_compiling: bool) -> tuple:
 
 
 def forget_kernels() -> None:
-    """Make Dr.Jit compile again what it has compiled before."""
+    """Empty Dr.Jit's caches, so that it compiles every kernel again."""
     dr.flush_kernel_cache()
     folder = os.environ["DRJIT_CACHE_DIR"]
     shutil.rmtree(folder, ignore_errors=True)
@@ -99,7 +98,7 @@ def measure(structures: dict[Method, object], surface: Surface, radius: float, s
     per_query = dict(zip(structures, taken.tolist(), strict=True))
     if EXACT not in structures:
         ratios = [None] * len(ratios)
-    # One grid of bins for all, as wide as the roughest needs.
+    # All have the same grid of bins, as wide as the roughest method needs.
     rough = any(roughness(pndf) > 0 for pndf in structures.values())
     bounds = normal_bounds(surface.normal_map, surface.epsilon, SIGMA_R if rough else 0.0)
     nothing = np.zeros((settings.res, settings.res))
@@ -172,8 +171,8 @@ def in_bins(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean of D over every bin of the reference, and its standard error, by jittered points.
 
-    Bins in which the reference has found something share about ``affordable`` points; the others,
-    which are empty or nearly so, have ``empty``² in each of the ``sets``.
+    Bins with samples of the reference share about ``affordable`` points. All other bins, which are
+    almost empty, have ``empty``² points in each of the ``sets``.
     """
     lower, upper = np.array(reference.bounds)
     size = (upper - lower) / reference.density.shape[::-1]
@@ -186,7 +185,7 @@ def in_bins(
         stratum = np.stack(np.divmod(np.arange(n * n), n), axis=-1)
         place = corner + (stratum + rng.random((len(row), n * n, 2))) / n
         m = mi.Vector2f(np.float32((lower + size * place).reshape(-1, 2).T))
-        # As many lanes of the footprint as normals, like the queries that are timed.
+        # The footprint has a lane for each normal, like the queries that are timed.
         lanes = Footprint(dr.repeat(footprint.uv, dr.width(m)), footprint.du, footprint.dv)
         density = pndf.eval(m, lanes).numpy()
         return density.reshape(len(row), n * n).mean(axis=1, dtype=np.float64)
@@ -209,9 +208,10 @@ def bias(count: int) -> float:
 def p_value(
     reference: BinnedPNDF, density: np.ndarray, deviation: np.ndarray, samples: int, sets: int
 ) -> float:
-    """Test the ``samples`` of the reference against a density from ``sets`` sets, by χ²."""
+    """The p-value of a χ² test of the reference's ``samples`` against a density from ``sets``."""
     area = reference.bin_area
-    # A variance estimated from n sets makes the square of a t-distribution, of this mean.
+    # With a variance that is estimated from n sets, a square follows the square of Student's t
+    # distribution, whose mean is this factor.
     deviation = deviation * bias(sets) * ((sets - 1) / (sets - 3)) ** 0.5
     return suite.p_value(
         samples * area * reference.density, samples, area * density, area * deviation
@@ -233,10 +233,10 @@ def norms(difference: np.ndarray, reference: BinnedPNDF) -> dict[str, float]:
 
 
 def noise(reference: BinnedPNDF, deviation: np.ndarray) -> dict[str, float]:
-    """What :func:`errors` an exact density would show, from the noise of both grids, in the mean.
+    """The expected :func:`errors` of an exact density, from the noise of both grids.
 
-    ``deviation`` is the standard error of the density. Bins in which the reference has found
-    nothing are left out, as in :attr:`BinnedPNDF.noise_floor`.
+    ``deviation`` is the standard error of the density. In bins without samples, the reference has
+    no noise, as in :attr:`BinnedPNDF.noise_floor`.
     """
     own = np.where(reference.density > 0, reference.standard_error, 0)
     total = np.hypot(own, deviation)
@@ -258,9 +258,9 @@ def times(
 ) -> tuple[np.ndarray, list[float]]:
     """Median seconds per query of every P-NDF, and how many times faster than the first it is.
 
-    One thread. All run in turn within every repetition, after a warm-up that compiles and finds how
-    many of the ``many`` queries make a batch. The time of a call with few queries, which is that of
-    tracing, is taken off.
+    One thread is used. All P-NDFs run in turn within every repetition. A warm-up compiles, and
+    finds the size of a batch of the ``many`` queries. The time of a call with few queries, which is
+    the time of tracing, is subtracted.
     """
     few = first(FEW, *many)
     with single_thread():
@@ -285,7 +285,7 @@ def first(count: int, m: mi.Vector2f, footprint: Footprint) -> tuple:
 
 
 def batch_size(pndf, many: tuple, wanted: float) -> int:
-    """Return how many queries take about ``wanted`` seconds besides tracing, from 2 ``FEW`` on."""
+    """The number of queries, at least 2 ``FEW``, that take ``wanted`` seconds besides tracing."""
     most = dr.width(many[0])
     traced = min(seconds(pndf.eval, *first(FEW, *many)) for _ in range(3))  # the first one compiles
     count = FEW

@@ -1,1 +1,1 @@
-"""How the report of ``error_vs_time`` is shown: fronts, pictures, files, and the page."""
+"""The report of ``error_vs_time``: Pareto fronts, figures, files, and the page."""

@@ -1,4 +1,4 @@
-"""The pictures: error against time, memory and samples. Needs matplotlib."""
+"""Figures of error over time, memory and samples; they need matplotlib."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from benchmarks.report import pareto
 
-#: Okabe and Ito's colours, told apart by all eyes, and markers, by family in order of appearance.
+#: Okabe and Ito's colours, which the colour-blind can distinguish, and markers, one per family.
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#000000", "#999999")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
-#: Marks of errors that are told from the noise of their measurement, and of those that are not.
-TOLD = {"markeredgecolor": "white", "markeredgewidth": 0.5}
-NOT_TOLD = {"markerfacecolor": "white", "markeredgewidth": 1.2}
+#: Marks of errors above the noise of their measurement, and of errors within it.
+ABOVE_NOISE = {"markeredgecolor": "white", "markeredgewidth": 0.5}
+WITHIN_NOISE = {"markerfacecolor": "white", "markeredgewidth": 1.2}
 
 METRICS = {"l1": "relative L1 error", "l2": "relative L2 error", "maximum": "maximum error"}
 
@@ -30,7 +30,7 @@ STYLE = {
 
 
 class Palette:
-    """A colour and a marker for every family; filters and baselines differ by marker as well."""
+    """A colour and a marker for every family."""
 
     def __init__(self, families: list[str]) -> None:
         families = list(dict.fromkeys(families))
@@ -40,7 +40,7 @@ class Palette:
 
 
 def save(figure: Figure, folder: Path, name: str) -> str:
-    """Write PNG and SVG; returns the SVG as text to put into a page."""
+    """Write PNG and SVG, and return the SVG as text for a page."""
     figure.savefig(folder / f"{name}.png", dpi=140)
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})
@@ -56,7 +56,7 @@ def draw(folder: Path, name: str, plot, *arguments) -> str:
 
 
 def logarithmic(*axes) -> None:
-    """Logarithmic axes (``axis.xaxis``) with plain numbers at 1, 2, 5, or decades where many."""
+    """Label logarithmic axes (``axis.xaxis``) at 1, 2, 5, or at decades if there are many."""
     for axis in axes:
         low, high = axis.get_view_interval()
         subdivided = high < 300 * low
@@ -90,9 +90,10 @@ def column(points: list[dict], key: str) -> np.ndarray:
 
 
 def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: str) -> Figure:
-    """Error against ``cost`` for one map, one panel per footprint; hollow where only noise.
+    """Error over ``cost`` for one map, with a panel for each footprint.
 
-    Lines at the bottom are the noise of the references, points on the front larger.
+    Errors within the noise are hollow. Horizontal lines are the noise of the references. Points on
+    the Pareto front are larger.
     """
     figure, axes = panels(len(units))
     scale, label = {
@@ -123,7 +124,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
                     palette.marker[family],
                     color=palette.colour[family],
                     markersize=6 if point["method"] in on_front else 4.5,
-                    **(TOLD if pareto.excess(point, metric) else NOT_TOLD),
+                    **(ABOVE_NOISE if pareto.excess(point, metric) else WITHIN_NOISE),
                     zorder=3,
                     gid=f"{name}--{point['id']}",
                 )
@@ -141,7 +142,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
 
 
 def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> Figure:
-    """Time per query against the footprint's size, one panel per map."""
+    """Time per query over the footprint's size, with a panel for each map."""
     figure, axes = panels(len(units_of_maps), most=3)
     lines = {}
     for axis, (title, units) in zip(axes, units_of_maps.items(), strict=True):
@@ -167,7 +168,7 @@ def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> F
 
 
 def images(name: str, points: list[dict], noise: float, names: list[str]) -> Figure:
-    """Error of images against time and against samples, with 95 % bands over the seeds."""
+    """Error of images over time and over samples, with 95 % bands over the seeds."""
     figure, axes = panels(2, width=4.6, height=3.6)
     colours = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))
     for index, method in enumerate(names):

@@ -1,4 +1,4 @@
-"""The files of the report: JSON, CSV, pictures, page; and a table of which method when."""
+"""The files of the report: JSON, CSV, figures, the page, and the table of fastest methods."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCHEMA_VERSION = 1
 
 
 def write(folder: Path, machine: dict, described: dict, found: dict, console: Console) -> dict:
-    """Write everything to ``folder``, print the table, and return what went into the JSON."""
+    """Write everything to ``folder``, print the table, and return the values of the JSON."""
     report = assemble(machine, described, found)
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
@@ -40,7 +40,7 @@ def write(folder: Path, machine: dict, described: dict, found: dict, console: Co
 
 
 def assemble(machine: dict, described: dict, found: dict) -> dict:
-    """The report as plain values; pictures and page name a point by its ``id``."""
+    """The report as plain values; figures and page refer to a point by its ``id``."""
     rungs = {method["name"]: method["rung"] for method in described["methods"]}
     units = []
     for index, (unit, _) in enumerate(found["pndf"]):
@@ -86,12 +86,12 @@ def of_maps(units: list[dict]) -> dict[str, list[dict]]:
 
 
 def picture(*parts: str) -> str:
-    """Name of a picture, without spaces."""
+    """Name of a figure, without spaces."""
     return "_".join(parts).replace(" ", "-")
 
 
 def draw(folder: Path, report: dict) -> dict[str, str]:
-    """All pictures, as SVG by name."""
+    """All figures, as SVG, by name."""
     palette = figures.Palette([method["family"] for method in report["methods"]])
     drawn = {}
     for name, units in of_maps(report["pndf"]).items():
@@ -115,7 +115,7 @@ def draw(folder: Path, report: dict) -> dict[str, str]:
 
 
 def thumbnails(report: dict, found: dict) -> dict[str, str]:
-    """Pictures of points as data URIs, by the points' ids; references by the unit's number."""
+    """Images of points as data URIs, by the points' ids; references by the unit's number."""
     uris = {}
     for index, (unit, (_, arrays)) in enumerate(zip(report["pndf"], found["pndf"], strict=True)):
         references = {key: a for key, a in arrays.items() if key.startswith("reference ")}
