@@ -17,6 +17,7 @@ import pytest
 
 from glintbsdf import NormalMap, maps
 from glintbsdf.cli import entry as cli
+from glintbsdf.examples import EXAMPLES
 from glintbsdf.scene import rendering, units
 
 SCENE = """<scene version="3.0.0">
@@ -513,3 +514,14 @@ def test_errors_of_python_plugins_lose_their_traceback():
 def test_help_names_the_commands(run):
     status, output, _ = run("--help")
     assert status == 0 and all(name in output for name in ("render", "pndf", "doctor"))
+
+
+def test_examples_are_listed_and_copied(folder, run):
+    status, listed, _ = run("example")
+    assert status == 0 and [line.split()[0] for line in listed.splitlines()] == list(EXAMPLES)
+    status, copied, told = run("example", "glitter", "-o", "new")
+    assert status == 0 and copied == "new/scene.xml\n" and Path("new/scene.xml").is_file()
+    assert told == "glintbsdf render new/scene.xml -o glitter.png\n"
+    status, _, error = run("example", "glitter", "-o", "new")
+    assert status == 1 and "new exists and is not an empty folder" in error
+    assert run("example", "gliter")[0] == 2

@@ -1,4 +1,5 @@
-"""The command line: ``render``, ``sequence``, ``pndf``, ``inspect``, ``synthesise``, ``doctor``.
+"""The command line: ``render``, ``sequence``, ``example``, ``pndf``, ``inspect``, ``synthesise``
+and ``doctor``.
 
 This module has only the parts that concern the terminal; other modules do the work.
 """
@@ -6,6 +7,7 @@ This module has only the parts that concern the terminal; other modules do the w
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any, NoReturn
@@ -27,6 +29,7 @@ from glintbsdf.cli.render_options import (
 )
 from glintbsdf.cli.render_options import options as render_options
 from glintbsdf.core.interruption import interruptible
+from glintbsdf.examples import EXAMPLES
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.scene import inspection, rendering
@@ -324,6 +327,28 @@ def inspect(
     _activate(variant)
     findings = inspection.inspect(inspection.load(scene, definitions), spp, sensor)
     click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")
+
+
+@commands.command()
+@click.argument("name", required=False, type=click.Choice(list(EXAMPLES)), metavar="[NAME]")
+@click.option(
+    "-o",
+    "folder",
+    type=click.Path(path_type=Path),
+    help="Folder to make.  [default: the example's name]",
+)
+def example(name: str | None, folder: Path | None) -> None:
+    """Copy out the scene NAME with its files, or list the scenes that come with the package."""
+    if name is None:
+        width = max(map(len, EXAMPLES))
+        for known in EXAMPLES.values():
+            click.echo(f"{known.name:{width}}  {known.title}")
+        return
+    mi.set_variant("scalar_rgb")  # enough to write images
+    scene, *files = EXAMPLES[name].copy(folder or name)
+    for path in (scene, *files):
+        click.echo(path)
+    click.echo(f"glintbsdf render {shlex.quote(str(scene))} -o {name}.png", err=True)
 
 
 @commands.command()
