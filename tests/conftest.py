@@ -1,4 +1,4 @@
-"""Options and fixtures that all tests share: the variant, a clean Dr.Jit, a cache of their own."""
+"""Options and fixtures of all tests: the variant, a clean Dr.Jit, and a separate cache."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def _activate(name: str) -> str:
-    """Choose the variant ``name``; skip the test where it was not compiled or has no device."""
+    """Choose the variant ``name``; skip the test if it is not compiled or has no device."""
     if name not in mi.variants():
         pytest.skip(f"this Mitsuba has no variant {name}")
     backend = dr.JitBackend.CUDA if name.startswith("cuda") else dr.JitBackend.LLVM
@@ -48,7 +48,7 @@ def _activate(name: str) -> str:
 
 @pytest.fixture
 def tune(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Change constants of every backend's table, by name, for the test."""
+    """Change constants, by name, in the tables of all backends, for one test."""
 
     def change(**values: float) -> None:
         for backend, table in tuning.TABLES.items():
@@ -65,13 +65,13 @@ def variant(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def each_variant(request: pytest.FixtureRequest) -> str:
-    """Run the test once in a spectral, a monochromatic and a polarised variant; for short tests."""
+    """Run a short test in a spectral, a monochromatic and a polarised variant."""
     return _activate(request.param)
 
 
 @pytest.fixture
 def told(variant: str, capfd: pytest.CaptureFixture[str]) -> Callable[[], list[str]]:
-    """A function that returns the warnings in Mitsuba's log since its last call, a line each."""
+    """A function that returns the warnings in Mitsuba's log since its last call, one per line."""
 
     def since() -> list[str]:
         text = "".join(capfd.readouterr())
@@ -90,7 +90,7 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _flush_drjit() -> Iterator[None]:
-    """Free what a test left behind, so that the memory of one run does not add up."""
+    """Free the memory of a test, so that it does not add up over a run."""
     yield
     if mi.variant() is not None and not mi.variant().startswith("scalar"):
         gc.collect()

@@ -1,7 +1,7 @@
-"""What is switched off costs nothing: operations of kernels, as Dr.Jit counts them, not time.
+"""Features that are switched off cost nothing: tests count operations of kernels, not time.
 
-A kernel is recorded for one call of a BSDF with inputs that Dr.Jit cannot know. Counts are the same
-on every run and every machine, so that "the same kernel" can be asked for.
+A kernel is recorded for one call of a BSDF, with inputs that Dr.Jit does not know. The counts are
+the same in every run and on every machine, so tests can require equal kernels.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _history(variant) -> Iterator[None]:
 
 
 def operations(record: Callable[[], object]) -> int:
-    """Operations of the largest kernel that computes what ``record`` returns."""
+    """Operations of the largest kernel that computes the result of ``record``."""
     result = record()
     dr.kernel_history_clear()
     dr.eval(result)
@@ -144,7 +144,7 @@ def test_a_feature_that_is_off_is_not_in_the_kernel_that_samples(plugin):
 
 @pytest.mark.parametrize("plugin", ["glint_manifold", "glint_elements"])
 def test_a_perfect_mirror_without_masking_is_the_p_ndf_alone(plugin):
-    """What a BSDF adds is a half vector, its Jacobian and the tests of the hemisphere."""
+    """A BSDF adds a half vector, its Jacobian and the tests of the hemisphere."""
     normal_map = NormalMap(MAP.normals)
     pndf = Manifold(normal_map) if plugin == "glint_manifold" else Elements(normal_map, 0.005)
     si = interaction()
@@ -177,7 +177,7 @@ def test_filters_look_up_the_moments_they_need_only():
 
 
 def test_no_footprint_no_code_for_its_extent():
-    """A stock integrator without pixel_spread gives a point."""
+    """Mitsuba's own integrators without pixel_spread give a point."""
     bsdf = make("glint_manifold", masking="none")
     assert evaluation(bsdf, partials=False) < evaluation(bsdf)
 

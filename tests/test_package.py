@@ -1,4 +1,4 @@
-"""The package as a whole: what importing it does and does not do, and what the README promises."""
+"""The package as a whole: effects of its import, and claims of the README."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def python(script: str) -> str:
-    """Run ``script`` in a fresh interpreter and return what it prints."""
+    """Run ``script`` in a fresh interpreter and return its output."""
     process = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
         capture_output=True,
@@ -48,7 +48,8 @@ def test_choosing_a_variant_loads_no_image_or_plotting_library(variant):
 
 
 def test_a_bsdf_loads_what_reads_its_file_and_no_more(variant, tmp_path):
-    """A map given as data needs no reader; what only some plugins need is not there either."""
+    """A map that is given as data needs no reader; libraries that only some plugins need are not
+    loaded either."""
     output = python(
         f"import sys, glintbsdf, mitsuba as mi; mi.set_variant('{variant}')\n"
         "data = mi.TensorXf([0.1] * 128, (8, 8, 2))\n"
@@ -78,7 +79,7 @@ def test_metadata_agree_with_the_package():
 
 
 def test_every_package_folder_is_installed():
-    """setuptools is given a list: a folder missing there would be missing in wheels only."""
+    """setuptools gets a list: a folder missing there would be missing in wheels only."""
     project = (ROOT / "pyproject.toml").read_text()
     listed = re.search(r"^packages = \[(.*?)\]$", project, re.M | re.S)[1]
     source = ROOT / "src"
@@ -99,7 +100,7 @@ def test_quick_start_is_two_commands():
 
 
 def test_python_example_of_the_readme_runs(tmp_path, variant, monkeypatch):
-    """As printed, at a lower quality."""
+    """The example as printed, with a lower quality."""
     readme = (ROOT / "README.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", readme, re.S)
     assert len([line for line in example.splitlines() if line]) <= 8

@@ -1,4 +1,5 @@
-"""The report of error against run time: its figures, that it goes on, its files, its page."""
+"""The report of error against run time: its figures, its continuation after an interruption, its
+files and its page."""
 
 import json
 import os
@@ -91,7 +92,8 @@ def test_bands_cover_the_mean_as_often_as_they_say():
 
 
 def test_bins_are_averaged_without_bias_and_with_the_error_they_have(variant):
-    """A density whose mean over bins is known: both its error and its noise are those measured."""
+    """For a density whose means over bins are known, the measured error and the measured noise are
+    correct."""
     import drjit as dr
     import mitsuba as mi
 
@@ -100,7 +102,7 @@ def test_bins_are_averaged_without_bias_and_with_the_error_they_have(variant):
     from glintbsdf.footprint.gaussian import Footprint
 
     class Ramp:
-        """Density 1 + x + 2 y², over the unit square."""
+        """The density 1 + x + 2 y² over the unit square."""
 
         def eval(self, m, footprint, active=True):
             return 1 + m.x + 2 * dr.square(m.y)
@@ -199,7 +201,7 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The folder of a report that was interrupted once."""
+    """The folder of a report that was interrupted once, and continued."""
     base = tmp_path_factory.mktemp("report")
     script, output = base / "run.py", base / "report"
     script.write_text(SCRIPT, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The harness of the benchmarks: options, tables, going on, and the commands that there are."""
+"""The harness of the benchmarks: options, tables, continuation, and the list of commands."""
 
 from __future__ import annotations
 

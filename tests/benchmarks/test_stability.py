@@ -1,4 +1,4 @@
-"""The command "stability": a short run, going on after one that was interrupted, its bounds."""
+"""The command "stability": a short run, its continuation after an interruption, and its bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What an integrator tells a BSDF: through Mitsuba's wrappers, and against neighbouring points."""
+"""The turn and the spread that an integrator passes to a BSDF: through Mitsuba's wrappers, and
+against half vectors at neighbouring points."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from glintbsdf.maps import procedural
 
 
 def interaction(count=64, seed=3):
-    """On a tilted surface whose shading normal is not the geometric one."""
+    """An interaction on a tilted surface whose shading normal differs from the geometric one."""
     rng = np.random.default_rng(seed)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.t = dr.ones(mi.Float, count)
@@ -41,7 +42,7 @@ def test_round_trip(variant):
 
 
 def test_curvature_is_not_taken_for_it(variant):
-    """Of an integrator that leaves the derivatives of normals in their place."""
+    """An integrator that leaves the derivatives of normals in the interaction passes no turn."""
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
     si = curved_interaction(
         scene.ray_intersect_preliminary(mi.Ray3f([0.1, 0.2, 5], [0, 0, -1])),
@@ -54,7 +55,8 @@ def test_curvature_is_not_taken_for_it(variant):
 
 @pytest.mark.parametrize("to_uv", [None, "scaled"])
 def test_wrappers_hand_it_on(variant, to_uv):
-    """``twosided``, ``mask``, ``blendbsdf`` and a flat ``normalmap`` around a glint BSDF."""
+    """``twosided``, ``mask``, ``blendbsdf`` and a flat ``normalmap`` pass it to the glint BSDF
+    inside."""
     transform = mi.ScalarTransform4f()
     data = mi.TensorXf(procedural.isotropic(32, seed=2).normals)
     glints = {"type": "glint_elements", "data": data, "sigma_r": 0.05, "masking": "none"}
@@ -89,8 +91,8 @@ def test_wrappers_hand_it_on(variant, to_uv):
 
 @pytest.mark.parametrize("inverse_distance", [0.0, 1 / 3])
 def test_turn_of_the_half_vector(variant, inverse_distance):
-    """On a sphere, near its equator, where the frame does not turn about the normal: against the
-    half vectors at neighbouring points, for a near camera."""
+    """On a sphere near its equator, where the frame does not turn about the normal, the turn agrees
+    with half vectors at neighbouring points, for a near camera."""
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 1.3}})
     camera = mi.Point3f(4, 0.3, 0.2)
     direction = dr.normalize(mi.Vector3f(1, 0.4, 0.3))
@@ -132,7 +134,7 @@ def test_turn_of_the_half_vector(variant, inverse_distance):
 
 
 def test_spread_of_the_half_vector(variant):
-    """Against half vectors of directions drawn about the light's."""
+    """The spread agrees with half vectors of random directions about the light's direction."""
     wi = dr.normalize(mi.Vector3f(0.3, -0.2, 1))
     wo = dr.normalize(mi.Vector3f(-0.5, 0.4, 0.8))
     sigma = 0.02

@@ -1,4 +1,5 @@
-"""Height maps as facets of the displaced surface, on any UVs, in every plugin that takes maps."""
+"""Height maps give the facets of the displaced surface, on any UVs, in every plugin that takes
+maps."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ def tensor(height: np.ndarray) -> mi.TensorXf:
 
 
 def surfaces(folder) -> dict:
-    """Shapes and transforms of UV under which texels lie turned, mirrored or stretched."""
+    """Shapes and transforms of UV on which texels are turned, mirrored or stretched."""
     for name, ends in (("plate", (0, 1)), ("mirrored", (1, 0))):
         (folder / f"{name}.obj").write_text(PLATE.format(*ends))
     transform = mi.ScalarTransform4f
@@ -63,7 +64,8 @@ def interaction(scene: mi.Scene, x, y) -> mi.SurfaceInteraction3f:
 
 
 def displaced_normal(shape: dict, to_uv, x: float, y: float) -> np.ndarray:
-    """Of the plate that the ramp displaces, by finite differences of places on the map."""
+    """The normal of the plate that the ramp displaces, by finite differences of positions on the
+    map."""
     scene = mi.load_dict({"type": "scene", "plate": dict(shape)})
     matrix = np.array(to_uv.matrix)[:2][:, [0, 1, 3]]
 
@@ -80,7 +82,7 @@ def displaced_normal(shape: dict, to_uv, x: float, y: float) -> np.ndarray:
 
 
 def mean_facet(scene: mi.Scene, x: float, y: float, count: int = 2048) -> np.ndarray:
-    """Mean direction in the world of the facets that reflect, by sampling from above."""
+    """Mean direction, in world space, of the facets that reflect, by sampling from above."""
     si = interaction(scene, mi.Float(np.full(count, x, np.float32)), y)
     u = suite.random_numbers(count, 3, seed=1)
     bs, _ = si.bsdf().sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
@@ -105,7 +107,7 @@ def test_facets_are_those_of_the_displaced_surface(variant, tmp_path, name):
 
 
 def test_normal_maps_stay_in_the_shading_frame(variant, tmp_path):
-    """As Mitsuba's ``normalmap`` has them, whatever UVs do."""
+    """As in Mitsuba's ``normalmap``, normals do not depend on the UVs."""
     normal = np.append(-SLOPES, 1) / np.sqrt(1 + SLOPES @ SLOPES)
     data = mi.TensorXf(np.ascontiguousarray(np.broadcast_to(np.float32(normal), (8, 8, 3))))
     for shape, to_uv in surfaces(tmp_path).values():
@@ -169,7 +171,7 @@ def test_stretched_facets_are_drawn_from_their_density(variant, plugin, options)
 
 @pytest.mark.parametrize("method", ["manifold", "oren_nayar"])
 def test_diffuse_facets_are_those_of_the_displaced_surface(variant, method):
-    """A plane's facets: a diffuse surface about the displaced normal."""
+    """For a plane, the facets are a diffuse surface about the displaced normal."""
     options = {"method": method, "reflectance": 0.5, "map_type": "height", "height_scale": 1.0}
     bsdf = mi.load_dict({"type": "glint_diffuse", "data": tensor(RAMP), **options})
     view = View(

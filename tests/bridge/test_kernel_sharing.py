@@ -1,4 +1,4 @@
-"""Nothing of a map is written into kernels: the second map of a scene compiles nothing anew."""
+"""Kernels contain no data of a map: the second map of a scene compiles nothing."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ METHODS = [
 
 
 def a_map(size: int = 64) -> np.ndarray:
-    """One that no earlier run has seen, as kernels are kept on disk.
+    """A map that no earlier run has used, as kernels are kept on disk.
 
-    All are about as steep: by that quadratures and levels of tables are chosen.
+    All maps have about the same slopes, as quadratures and levels of tables depend on them.
     """
     rng = np.random.default_rng()
     alpha, length = rng.uniform(0.09, 0.11), rng.uniform(5, 7)
@@ -54,7 +54,7 @@ def plate(plugin: str, options: dict, size: int = 64, wrapped: bool = False) -> 
 
 
 def compiled(action) -> int:
-    """How many kernels an action compiles."""
+    """Number of kernels that an action compiles."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         action()
@@ -107,7 +107,8 @@ def test_another_data_compiles_nothing(variant, plugin, options):
 
 @pytest.mark.parametrize(("plugin", "options"), METHODS[:1] + METHODS[5:], ids=str)
 def test_bsdfs_go_with_their_scenes(variant, plugin, options):
-    """At once, without the garbage collector: a cycle would keep maps and kernels alive."""
+    """They are freed at once, without the garbage collector: a reference cycle would keep maps and
+    kernels alive."""
     from glintbsdf.bridge.bsdf import FootprintBSDF  # of the active variant
 
     gc.collect()

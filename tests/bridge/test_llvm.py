@@ -1,4 +1,4 @@
-"""Which LLVM is found, chosen and refused."""
+"""Search, choice and refusal of LLVM libraries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from glintbsdf.bridge import llvm
 
 
 def python(script: str, named: str | None = None) -> subprocess.CompletedProcess:
-    """Run ``script`` in a fresh interpreter, with a library named in the environment or none."""
+    """Run ``script`` in a fresh interpreter, with a library in the environment or without."""
     environment = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
     if named is not None:
         environment[llvm.VARIABLE] = named
@@ -109,7 +109,7 @@ def test_too_old_a_library_is_an_error_before_drjit_aborts(too_old, usable):
 
 
 def test_too_late_an_import_says_what_to_change(too_old, usable):
-    """Dr.Jit has chosen its library by now."""
+    """After Dr.Jit has chosen its library, the import raises an error that says what to change."""
     process = python(
         "import os, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
         f"del os.environ['{llvm.VARIABLE}']\n"
@@ -145,7 +145,7 @@ def test_no_library_at_all_is_an_error(monkeypatch):
 
 
 def test_choice_without_a_usable_library_is_silent(monkeypatch):
-    """Programs that run on the GPU need none."""
+    """Programs that run on the GPU need no LLVM."""
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "loaded_version", lambda: None)
     monkeypatch.setattr(llvm, "find", list)

@@ -1,4 +1,4 @@
-"""How parameters arrive from Mitsuba, and what is made of them. Errors: see ``suite.py``."""
+"""Conversion of parameters from Mitsuba's properties. For errors see ``suite.py``."""
 
 from __future__ import annotations
 

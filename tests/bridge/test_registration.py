@@ -1,4 +1,4 @@
-"""Plugins are known in every variant, whatever the order of imports and changes of variant."""
+"""Plugins are registered in every variant, for any order of imports and changes of variant."""
 
 from __future__ import annotations
 

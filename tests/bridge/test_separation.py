@@ -1,4 +1,5 @@
-"""Separated illumination: smooth lobes wherever they are asked for, the parts of ``glint_path``."""
+"""Separated illumination: the smooth lobes of glint BSDFs, and the separate images of
+``glint_path``."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ def manifold(**parameters) -> dict:
 
 
 def rough(normal_map: NormalMap = MAP, **parameters) -> dict:
-    """Mitsuba's BSDF with the roughness of a whole map."""
+    """Mitsuba's BSDF with the roughness of the whole map."""
     alpha_u, alpha_v = normal_map.roughness()
     return {"type": "roughconductor", "alpha_u": alpha_u, "alpha_v": alpha_v, **parameters}
 
@@ -55,7 +56,7 @@ def wrapped(name: str, bsdf: dict) -> dict:
 
 
 def everything(bsdf: dict, ctx: mi.BSDFContext, view: suite.View = VIEW) -> list[np.ndarray]:
-    """Direction, density and weight of samples, zero where they are invalid; value and density of
+    """Direction, density and weight of samples, zero if they are invalid; and value and density for
     other directions."""
     bsdf = mi.load_dict(bsdf)
     u = suite.random_numbers(500, 5, seed=2)
@@ -83,7 +84,8 @@ def assert_same(ours: dict, theirs: dict) -> None:
     "name", ["itself", "twosided", "blendbsdf", "mask", "bumpmap", "normalmap", "all"]
 )
 def test_smooth_lobe_is_that_of_roughconductor(variant, name):
-    """Wherever the BSDF is nested; and an ordinary context still gets the glints."""
+    """At any nesting of the BSDF, the smooth context gives the lobe of roughconductor, and an
+    ordinary context still gives glints."""
     metal = {"material": "Au"}
     assert_same(wrapped(name, manifold(**metal)), wrapped(name, rough(**metal)))
     glints, smooth = (
@@ -108,7 +110,7 @@ def test_smooth_lobe_of_a_hand_over(variant):
 
 @pytest.mark.parametrize("plugin", ["glint_elements", "glint_mip"])
 def test_smooth_lobe_has_the_intrinsic_roughness(variant, plugin):
-    """Squared roughness adds up: that of the map, and twice the variance of a lobe's normals."""
+    """Squared roughnesses add: that of the map, and twice the variance of an element's normals."""
     sigma_r = 0.1
     ours = {"type": plugin, "data": mi.TensorXf(MAP.normals), "sigma_r": sigma_r}
     if plugin == "glint_mip":
@@ -120,7 +122,7 @@ def test_smooth_lobe_has_the_intrinsic_roughness(variant, plugin):
 
 
 def test_smooth_lobe_of_flakes(variant):
-    """Also after their intrinsic roughness has changed."""
+    """The smooth lobe follows a change of the intrinsic roughness."""
     flakes = {"type": "glint_elements", "flake_density": 100.0, "flake_alpha": 0.2}
     theirs = {"type": "roughconductor", "alpha": float(np.sqrt(0.2**2 + 2 * 0.05**2))}
     assert_same({**flakes, "sigma_r": 0.05}, theirs)
@@ -135,7 +137,7 @@ def test_smooth_lobe_of_flakes(variant):
 
 
 def test_smooth_lobe_of_a_flat_map(variant):
-    """Mitsuba's smallest roughness, 1e-4, and nothing that is not finite."""
+    """It has Mitsuba's smallest roughness, 1e-4, and finite values."""
     flat = NormalMap(np.zeros((4, 4, 2), np.float32))
     ours = {"type": "glint_manifold", "data": mi.TensorXf(flat.normals), "masking": "none"}
     theirs = {"type": "roughconductor", "alpha": 1e-4}
@@ -146,7 +148,7 @@ def test_smooth_lobe_of_a_flat_map(variant):
 
 
 def test_smooth_lobe_of_a_grid(variant):
-    """The macroscopic surface, tinted by the mean colour of its microdetails."""
+    """It is the whole surface, with the mean colour of its microdetails."""
     grid = {"type": "glint_grid", "alpha_u": 0.3, "alpha_v": 0.2, "intensity": 0.7}
     theirs = {"type": "roughconductor", "alpha_u": 0.3, "alpha_v": 0.2}
     assert_same(grid, {**theirs, "specular_reflectance": 0.7})
@@ -187,7 +189,7 @@ def test_context(variant):
 
 
 def test_smooth_lobe_follows_the_map(variant):
-    """New data gives a new roughness; derivatives reach the data."""
+    """New data give a new roughness, and derivatives reach the data."""
     bsdf = mi.load_dict(manifold())
     parameters = mi.traverse(bsdf)
     other = maps.isotropic(64, seed=4)
@@ -251,7 +253,7 @@ def render(scene: mi.Scene, spp: int = 16, seed: int = 1, **parameters) -> np.nd
 
 
 def parts(scene: mi.Scene, **parameters) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whole, direct and indirect image."""
+    """The whole image, its direct light and its indirect light."""
     image = render(scene, separate=True, **parameters)
     return image[..., :-6], image[..., -6:-3], image[..., -3:]
 
@@ -269,7 +271,7 @@ def test_parts_add_up_in_each_variant(each_variant):
 
 
 def test_direct_light_is_that_of_paths_of_two_segments(variant):
-    """With the same random numbers, sample by sample: glints in all direct light."""
+    """All direct light has glints; with the same random numbers, it is equal sample by sample."""
     scene = room(manifold())
     _, direct, _ = parts(scene, max_depth=8)
     # Measured: 1e-6; other kernels round otherwise.
@@ -277,7 +279,7 @@ def test_direct_light_is_that_of_paths_of_two_segments(variant):
 
 
 def test_indirect_light_is_that_of_the_smooth_metal(variant):
-    """And of no glint: the scene with ``roughconductor`` gives the same indirect image."""
+    """It has no glints: the scene with ``roughconductor`` gives the same indirect image."""
     # With the same random numbers, whether or not a scene has glints
     alike = {"spp": 64, "pixel_share": 0.5, "emitters": "one"}
     _, _, indirect = parts(room(manifold()), **alike)
@@ -287,7 +289,7 @@ def test_indirect_light_is_that_of_the_smooth_metal(variant):
 
 
 def test_smooth_scenes_look_the_same(variant):
-    """Where no BSDF glints, separating changes nothing but the random numbers' use."""
+    """Without glint BSDFs, separation changes only the use of random numbers."""
     scene = room(rough(material="Cr"))
     differences = [
         parts(scene, spp=64, seed=seed, rr_depth=2)[0] - render(scene, 64, seed + 100, rr_depth=2)
@@ -299,7 +301,7 @@ def test_smooth_scenes_look_the_same(variant):
 
 
 def test_glints_are_seen_in_mirrors(variant):
-    """What a mirror shows counts as seen by the camera (cf. Tan et al. 2022, Fig. 18)."""
+    """Surfaces in a mirror count as seen by the camera (cf. Tan et al. 2022, Fig. 18)."""
     transform = mi.ScalarTransform4f()
     mirror = {
         "type": "rectangle",
@@ -330,7 +332,7 @@ def test_depths(variant):
 
 
 def test_off_asks_for_nothing_more(variant):
-    """Without ``separate``, a BSDF is traced for its glints alone, and there are no AOVs."""
+    """Without ``separate``, a BSDF is traced only for its glints, and there are no AOVs."""
     seen = []
 
     class Spy(mi.BSDF):
@@ -362,7 +364,8 @@ def test_off_asks_for_nothing_more(variant):
 
 @pytest.mark.parametrize("key", ["plate.bsdf.alpha_u.value", "lamp.emitter.radiance.value"])
 def test_gradients_are_those_of_the_whole(variant, key):
-    """Where nothing glints, with the same samples and without russian roulette."""
+    """Without glint BSDFs, the gradients of both parts add up, for the same samples and without
+    russian roulette."""
     scene = room(rough())
     parameters = mi.traverse(scene)
 

@@ -1,4 +1,4 @@
-"""Which surfaces a BSDF is on, and what is told of those that do not fit its map."""
+"""The shapes of a BSDF, and warnings and errors about shapes that do not fit its map."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_a_mesh_without_uvs_is_refused_from_python_as_well(variant, folder, wher
 def test_green_that_does_not_fit_the_surface_is_told(
     variant, folder, capfd, left_handed, mirrored, data
 ):
-    """On left-handed UVs, or where to_uv mirrors, the second component runs against the rows."""
+    """On left-handed UVs, or if to_uv mirrors, the second component points against the rows."""
     to_uv = mi.ScalarTransform4f().scale([1, -1 if mirrored else 1, 1])
     shape = mesh(folder, flip_tex_coords=left_handed)
     values = VECTORS if data == "ours" else OPPOSITE

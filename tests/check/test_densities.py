@@ -1,4 +1,4 @@
-"""Adaptive quadrature of densities: spikes, needles, densities that are not those drawn from."""
+"""Adaptive quadrature of densities: narrow spikes, and densities that differ from the samples."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_view_that_sees_no_facet(variant):
 
 
 class Stated:
-    """A BSDF that states another density than the one it draws from."""
+    """A BSDF whose pdf differs from the density of its samples."""
 
     def __init__(self, bsdf, pdf):
         self.bsdf, self.pdf = bsdf, pdf

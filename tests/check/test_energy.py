@@ -1,4 +1,4 @@
-"""Energy of every method with a map: at each place, and on average, against ray tracing."""
+"""Energy of every method with a map, at each place and on average, against ray tracing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values of every kind for every parameter: used, or refused in one sentence that names them."""
+"""Values of every kind for every parameter are either used, or refused in one sentence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_every_value_is_used_or_refused(variant):
 
 
 def test_what_is_used_has_finite_values():
-    """In a process of its own: a crash or an endless loop is an outcome like others."""
+    """In separate processes, so that crashes and endless loops are outcomes, too."""
     report = fuzz(60, seed=4)
     assert not report.faults, str(report)
     assert report.counts.total() == 60 and report.counts["used"] > 2

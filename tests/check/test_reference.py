@@ -1,4 +1,4 @@
-"""The binned reference against cases whose answer is known in closed form."""
+"""The binned reference, against cases with a known closed form."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ MIDDLE = (0.5, 0.5)
 
 
 def linear_map():
-    """Normals that are a linear function of position, zero in the middle of the map."""
+    """Normals that are a linear function of position, and zero in the middle of the map."""
     position = np.arange(SIZE) - (SIZE - 1) / 2
     x, y = np.meshgrid(position, position)
     return NormalMap(np.stack((x, y), axis=2) @ GRADIENT.T, "clamp")
 
 
 def bin_centres(binned):
-    """Bin centres, an array of shape (res, res, 2)."""
+    """Centres of the bins, an array of shape (res, res, 2)."""
     x, y = (0.5 * (edges[1:] + edges[:-1]) for edges in binned.edges)
     return np.stack(np.meshgrid(x, y), axis=2)
 
 
 def mean_density(density, bounds, res, subdivision=8):
-    """Means over bins of a density given by formula, from subdivision² points in each."""
+    """Means over bins of a density that is given by a formula, from subdivision² points in each
+    bin."""
     (x_min, y_min), (x_max, y_max) = bounds
     fraction = (np.arange(res * subdivision) + 0.5) / (res * subdivision)
     x, y = np.meshgrid(x_min + (x_max - x_min) * fraction, y_min + (y_max - y_min) * fraction)
@@ -176,7 +177,7 @@ def test_mirror_is_a_point():
 
 
 def normal_at(normal_map, row, column, epsilon=0.0):
-    """The surface's normal at one point, (row, column) in texels, by bins of 1e-5."""
+    """The surface's normal at one point, (row, column) in texels, from bins of 1e-5."""
     uv = (column + 0.5) / normal_map.width, (row + 0.5) / normal_map.height
     binned = binned_pndf(
         normal_map,

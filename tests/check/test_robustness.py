@@ -1,4 +1,4 @@
-"""What is stiff and extreme: measures on cases whose answer is known."""
+"""Measures of numerical robustness, for cases with a known answer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from glintbsdf.check import robustness
 
 def test_extremes_are_counted(variant):
     class Broken:
-        """Not a number where footprints are a point, negative where they are huge."""
+        """A BSDF that is NaN for point footprints, and negative for huge ones."""
 
         def sample(self, ctx, si, sample1, sample2):
             bs = dr.zeros(mi.BSDFSample3f, dr.width(si))

@@ -1,4 +1,4 @@
-"""The shared suite: what a failed χ² test leaves behind."""
+"""The test suite for BSDFs: the table that a failed χ² test writes."""
 
 from __future__ import annotations
 

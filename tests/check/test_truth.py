@@ -1,4 +1,4 @@
-"""The brute-force truth: its map, its error, and that glint_manifold agrees with it."""
+"""Brute-force reference images: their map, their error, and the agreement of glint_manifold."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_refined_map_is_the_mesh(variant, wrap_mode):
 
 
 def scene(material: dict) -> mi.Scene:
-    """A plate, seen from straight above through a long lens, under a round light."""
+    """A plate, seen from above through a long lens, under a round light."""
     above = mi.ScalarTransform4f().look_at([0, 0, 30], [0, 0, 0], [0, 1, 0])
     return mi.load_dict(
         {

@@ -1,4 +1,4 @@
-"""The command line, run in this process: what it writes, sets, prints and refuses."""
+"""The command line, run in this process: files, settings, messages and errors."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SCENE = """<scene version="3.0.0">
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder, made the current one, with a small scene in it and its map."""
+    """The current folder, with a small scene and its map in it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(SCENE)
     heights = np.random.default_rng(1).random((16, 16, 1), dtype=np.float32)
@@ -133,7 +133,8 @@ def test_aov_images(run, folder):
 
 
 def test_one_thread_does_not_hang(run, folder):
-    """Mitsuba would wait for ever for a second thread while it reads the OpenEXR environment."""
+    """With one thread, Mitsuba would wait for a second one for ever while it reads the OpenEXR
+    environment."""
     text = SCENE.replace(
         '<emitter type="constant"/>',
         '<emitter type="envmap"><string name="filename" value="map.exr"/></emitter>',
@@ -248,7 +249,7 @@ def test_files_of_the_scene_are_not_written_over(run, folder):
 
 
 def test_what_is_said_of_footprints_fits_the_scene(folder, variant, capfd):
-    """With an orthographic camera, and on a curve, no footprint follows from pixel_spread."""
+    """With an orthographic camera, and on a curve, pixel_spread gives no footprint."""
     parallel = SCENE.replace("perspective", "orthographic").replace(
         '<float name="fov" value="30"/>', ""
     )
@@ -270,7 +271,7 @@ def test_what_is_said_of_footprints_fits_the_scene(folder, variant, capfd):
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
 def test_a_full_disk_is_told(folder, variant, name):
-    """Mitsuba writes what fits, or nothing, and does not tell."""
+    """Mitsuba writes as much as fits, or nothing, without an error; the command reports it."""
     before = set(folder.iterdir())
     code = (
         "import resource as r, sys; from glintbsdf.cli import entry; from glintbsdf.scene import "
@@ -315,7 +316,7 @@ def test_interruption_leaves_nothing_half_done(folder, variant):
 
 
 def test_interruption_keeps_what_is_done(run, folder, monkeypatch):
-    """Three passes of sixteen: an image without a bias, of three times the samples of one pass."""
+    """Three passes of sixteen give an unbiased image with three times the samples of one pass."""
     monkeypatch.setattr(units, "FEWEST", 256)
     original = rendering.Renderer.render
 
@@ -381,7 +382,7 @@ def test_bsdfs_get_the_footprint_of_the_whole_image(folder, variant, own_spread)
 
 
 def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):
-    """The same light in one pass and in eight, within the noise of both."""
+    """One pass and eight passes have the same mean, within the noise of both."""
     images = {}
     for size in (1 << 18, 512):
         monkeypatch.setattr(units, "FEWEST", size)

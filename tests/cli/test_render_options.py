@@ -1,4 +1,4 @@
-"""Where and how long an image is made: what the options say, refuse and print."""
+"""Options of rendering commands: their effects, errors and output."""
 
 from __future__ import annotations
 
@@ -156,7 +156,8 @@ def test_workers(run, folder):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a POSIX signal")
 def test_ctrl_c_ends_workers_as_well(folder, variant):
-    """As a terminal sends it: to all processes at once. The picture of what is done stays."""
+    """A terminal sends Ctrl-C to all processes at once. The finished part of the image is
+    written."""
     pytest.importorskip("distributed")
     command = ["render", "scene.xml", "-m", variant, "--workers", "2", "--spp", str(1 << 24)]
     process = subprocess.Popen(

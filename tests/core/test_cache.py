@@ -1,4 +1,4 @@
-"""The disk cache: it returns what was stored, or builds, whatever has happened to the disk."""
+"""The disk cache returns what was stored, or builds it, whatever has happened to the disk."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def warned(monkeypatch):
-    """The warnings that the cache gives, as a list of their texts."""
+    """The warnings of the cache, as a list of texts."""
     messages = []
     monkeypatch.setattr(cache, "warn", messages.append)
     return messages
 
 
 class Builder:
-    """Counts how often it builds."""
+    """A builder that counts its calls."""
 
     def __init__(self, seed=0):
         self.calls = 0
@@ -206,7 +206,7 @@ def test_a_full_disk_stays_as_it_was(folder, warned):
 
 
 def slow_build():
-    """Leaves a mark, and takes long enough for others to come."""
+    """Leaves a mark, and takes long enough for other processes to come."""
     (cache.directory() / f"built-by-{os.getpid()}").touch()
     time.sleep(1)
     return {"a": np.arange(10)}
@@ -225,7 +225,7 @@ def test_processes_build_once(folder):
 
 
 def hammer(seed):
-    """Write and read one key over and over; any mixture of two files would show."""
+    """Write and read one key over and over; any mixture of two files would be noticed."""
     for _ in range(30):
         arrays = cache.load_or_build(
             lambda: {name: np.full(100_000, 7.0) for name in ("first", "second")}, "shared"

@@ -1,4 +1,4 @@
-"""Hashed random numbers: repeatable, uniform, independent, and the same on coherent grids."""
+"""Hashed random numbers: repeatable, uniform, independent, and equal on coherent grids."""
 
 from __future__ import annotations
 

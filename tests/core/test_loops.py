@@ -1,4 +1,4 @@
-"""Loops keep the derivatives of what their bodies capture, wherever they run."""
+"""Loops keep the derivatives of captured values, wherever they run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TURNS = 5
 
 
 def count_and_add(term, zero):
-    """Σ term(k) over k = 0 … TURNS − 1, beginning with ``zero``."""
+    """Σ term(k) over k = 0 … TURNS − 1, starting with ``zero``."""
 
     def body(k, total):
         return k + 1, total + term(mi.Float(k))
@@ -78,7 +78,7 @@ def by_function(x):
 
 
 def by_nested_loop(x):
-    """Σ_j Σ_k (j + k) x² / TURNS, less what is there in excess of Σ k x²."""
+    """Σ_j Σ_k (j + k) x² / TURNS, minus its excess over Σ k x²."""
     y = x * x
 
     def inner(j):
@@ -93,7 +93,7 @@ FACTOR = sum(range(TURNS))
 
 
 def in_a_call(function, x):
-    """The function in a recorded call in a recorded loop, as a BSDF in an integrator."""
+    """The function in a recorded call in a recorded loop, like a BSDF in an integrator."""
 
     def body(n, total):
         index = mi.UInt32(dr.opaque(mi.UInt32, 0))
@@ -121,7 +121,7 @@ def test_derivative_of_what_is_captured(variant, function, mode):
 
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_narrow_values_in_nested_loops(variant, mode):
-    """Of three lanes, with a derivative that all have in common."""
+    """Three lanes, with a derivative with respect to a value that they share."""
     x = mi.Float(0.7)
     dr.enable_grad(x)
     y = by_nested_loop(x) * mi.Float(1, 2, 3)
@@ -142,7 +142,7 @@ def test_value_without_derivatives(variant, function):
 
 
 def test_arrays_in_memory_stay_where_they_are(variant):
-    """What is gathered from has a size of its own."""
+    """Arrays to gather from may have any size."""
     table = mi.Float([1, 2, 3, 4, 5])
     dr.enable_grad(table)
     total = count_and_add(lambda k: dr.gather(mi.Float, table, mi.UInt32(k)), mi.Float(0))

@@ -1,4 +1,4 @@
-"""Slow work shows: by a bar on a terminal, by lines in a log."""
+"""Slow work shows its progress: by a bar on a terminal, by lines in a log."""
 
 from __future__ import annotations
 

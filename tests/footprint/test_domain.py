@@ -1,4 +1,5 @@
-"""What is built for a domain: smaller, and within the domain the same to the last bit."""
+"""Structures for a domain are smaller, and within the domain their values are equal to the last
+bit."""
 
 from __future__ import annotations
 
@@ -35,8 +36,8 @@ def normal_map(wrap_mode: str = "repeat") -> NormalMap:
 def footprints(
     centre=(0.4, 0.3), sigma: float = 2.0, spread: float = 0.1, stretch: float = 2.0
 ) -> Footprint:
-    """Random ones, about ``centre`` (UV): minor axes of ``sigma`` to 2 ``sigma`` texels, major ones
-    up to ``stretch`` times as long."""
+    """Random footprints around ``centre`` (UV). Their minor axes have ``sigma`` to 2 ``sigma``
+    texels; major axes are up to ``stretch`` times as long."""
     rng = np.random.default_rng(5)
     uv = np.asarray(centre)[:, None] + spread * (rng.random((2, COUNT)) - 0.5)
     angle, minor = rng.uniform(0, np.pi, COUNT), sigma * rng.uniform(1, 2, COUNT)
@@ -170,7 +171,7 @@ def test_levels_of_a_filter(variant, method, sigma):
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 @pytest.mark.parametrize("centre", [(0.4, 0.3), (0.98, 0.5), (1.5, 1.6)])
 def test_parts_of_levels(variant, wrap_mode, centre):
-    """Stretched footprints look up places all along their major axes."""
+    """Stretched footprints look up samples all along their major axes."""
     whole_map, m = normal_map(wrap_mode), normals()
     footprint = footprints(centre, sigma=0.3, stretch=20)
     trimmed = Filtered(whole_map, "clean", domain=recorded(whole_map, footprint))

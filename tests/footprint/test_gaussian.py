@@ -1,4 +1,4 @@
-"""The footprint: its covariance, where it comes from, and what happens where it is degenerate."""
+"""The footprint: its covariance, its sources, and degenerate cases."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_isotropic_and_to_uv(variant):
 
 
 def test_cone_is_the_ellipse_of_a_round_beam(variant):
-    """Against the closed form w² (I + a aᵀ/cos²), a the tangential part of the direction."""
+    """It has the closed form w² (I + a aᵀ/cos²), with a the tangential part of the direction."""
     si = interactions(seed=1, count=500)
     cone = covariance(Footprint.from_interaction(si, 1.0, 1e-3))
 
@@ -79,7 +79,7 @@ def test_cone_is_the_ellipse_of_a_round_beam(variant):
 
 
 def test_cone_agrees_with_ray_differentials(variant):
-    """Across the middle of an oblique image, a square pixel is a cone of its own angle."""
+    """In the middle of an oblique image, a square pixel is the cone of its own angle."""
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -104,7 +104,7 @@ def test_cone_agrees_with_ray_differentials(variant):
 
 
 def test_cone_from_either_side(variant):
-    """``twosided`` hands on a mirrored direction; the back is seen under the same footprint."""
+    """``twosided`` passes a mirrored direction; the back has the same footprint."""
     si = interactions(seed=6, count=100)
     front = covariance(Footprint.from_interaction(si, 0.5, 1e-3))
     si.wi.z = -si.wi.z
@@ -127,7 +127,7 @@ def test_source_is_chosen_per_lane(variant):
 
 
 def test_mitsuba_footprint_where_it_exists(variant):
-    """The 2×2 matrix of Mitsuba's next release, on a stand-in with its columns."""
+    """The 2×2 matrix of Mitsuba's next release, in an object with its columns."""
 
     class Interaction:
         pass
@@ -141,7 +141,7 @@ def test_mitsuba_footprint_where_it_exists(variant):
 
 
 def test_known_zero_records_nothing(variant):
-    """What a stock integrator passes: literal zeros, seen without evaluating anything."""
+    """Mitsuba's own integrators pass literal zeros, which are recognised without an evaluation."""
     si = interactions(seed=5, count=1)
     opaque_sigma = dr.opaque(mi.Float, 0.5)
     assert Footprint.from_interaction(si, opaque_sigma, 0.0).is_known_to_be_zero()
@@ -153,7 +153,8 @@ def test_known_zero_records_nothing(variant):
 
 @pytest.mark.parametrize("case", ["zero", "zero_v", "parallel", "nan", "grazing", "missed", "far"])
 def test_degenerate_interactions(variant, case):
-    """A point, never NaN, and derivatives that stay finite; the healthy lane is unaffected."""
+    """They give a point, never NaN, and finite derivatives; a healthy lane beside them is not
+    affected."""
     si = interactions(seed=3, count=2)
     healthy = np.array([False, True])
 
@@ -196,7 +197,7 @@ def test_degenerate_interactions(variant, case):
 
 
 def test_derivatives(variant):
-    """d Σ/dσ = 2 Σ/σ and d Σ/d spread = 2 Σ/spread, from Dr.Jit."""
+    """d Σ/dσ = 2 Σ/σ and d Σ/d spread = 2 Σ/spread, by Dr.Jit."""
     si = interactions(seed=4, count=1)
     for index in range(2):
         values = [mi.Float(0.4), mi.Float(0.02)]

@@ -1,4 +1,4 @@
-"""Footprint kernels: unit integrals, samplers, extents, stiff footprints."""
+"""Footprint kernels: integrals, samplers, extents, and stiff footprints."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def test_samples_have_the_covariance_and_stay_inside(variant, kernel, axes):
 @pytest.mark.parametrize("axes", FOOTPRINTS.values(), ids=FOOTPRINTS)
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_integral_is_one(variant, kernel, axes):
-    """E[1/k] over samples is the area of the support, and k's mean over it 1/area."""
+    """E[1/k] over samples is the area of the support, and the mean of k over the support is
+    1/area."""
     k = texel_kernel(kernel, axes)
     offset = samples(k)
     value = k.value(mi.Vector2f(*(mi.Float(np.float32(x)) for x in offset))).numpy()
@@ -157,8 +158,9 @@ def test_unknown_kernel_is_refused(variant):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_derivatives_of_averages(variant, kernel):
-    """Those of the integral, 0, and of the variances, for a footprint that grows by a factor, and
-    the mean's, 1, for one that moves, although the edges that move are in no value."""
+    """The derivatives of the integral (0) and of the variances, for a footprint that grows by a
+    factor, and of the mean (1), for one that moves. They are correct although no value shows the
+    moving edges."""
     n, extent = 900, 9.0  # jittered points of a square around the footprint
     rng = np.random.default_rng(0)
     x, y = (

@@ -1,4 +1,4 @@
-"""The lattice against wrapping written out in NumPy."""
+"""The lattice, against wrapping in NumPy."""
 
 from __future__ import annotations
 

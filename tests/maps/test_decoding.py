@@ -1,4 +1,4 @@
-"""What the numbers of a map mean: encodings, greyness, padding, voids, and what is told of it."""
+"""Decoding of maps: encodings, grey images, padding, voids, and the messages about them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIZE = 48
 
 
 def bumps(seed: int = 0) -> np.ndarray:
-    """Smooth heights in [0, 1], wrapping around."""
+    """Smooth heights in [0, 1], which wrap around."""
     noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE))
     height = gaussian_filter(noise, 3, mode="wrap")
     return (height - height.min()) / np.ptp(height)

@@ -1,4 +1,4 @@
-"""Normal maps: conventions, every source, and what is refused."""
+"""Normal maps: conventions, all sources, and errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def random_heights(shape=SHAPE, seed=RNG_SEED):
 
 
 def encode(normals, dtype):
-    """Store normals or heights' fractions as unsigned integers."""
+    """Store normals, or fractions of heights, as unsigned integers."""
     return np.round((normals + 1) / 2 * np.iinfo(dtype).max).astype(dtype)
 
 

@@ -1,4 +1,4 @@
-"""Procedural maps: size, seed, tiling, and the statistics that their parameters promise."""
+"""Procedural maps: size, seed, tiling, and the statistics that their parameters determine."""
 
 from __future__ import annotations
 

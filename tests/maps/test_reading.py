@@ -1,4 +1,4 @@
-"""Files with several layers, with inverted or void values, and what is taken of them."""
+"""Reading of files with several layers, and with inverted or void values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLOURS = np.random.default_rng(1).random((16, 16, 3)).astype(np.float32)
 
 
 def write_exr(path, **layers) -> str:
-    """Each layer: H x W x C values, and the names of the channels."""
+    """Write layers, each with H x W x C values and the names of its channels."""
     channels = {}
     for layer, (values, names) in layers.items():
         for i, name in enumerate(names):

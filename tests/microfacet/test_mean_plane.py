@@ -1,4 +1,4 @@
-"""Masking over the mean plane: the areas, and that no more is reflected than is received."""
+"""Masking over the mean plane: the areas, and that no more light is reflected than received."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from glintbsdf.microfacet.mean_plane import (
 
 
 def directions(rng, count: int) -> np.ndarray:
-    """Unit vectors (3, N) of the upper hemisphere, a half of them within 6° of the horizon."""
+    """Unit vectors (3, N) of the upper hemisphere, half of them within 6° of the horizon."""
     z = np.where(rng.random(count) < 0.5, rng.random(count), 0.1 * rng.random(count))
     phi = 2 * np.pi * rng.random(count)
     r = np.sqrt(1 - z * z)
@@ -29,8 +29,8 @@ def vector(v: np.ndarray) -> mi.Vector3f:
 
 
 def reflected(slopes: np.ndarray, wi: np.ndarray, correlated: bool) -> float:
-    """Energy that facets of these slopes (2, N), mirrors, reflect of uniform light, in float64 but
-    for V, whose areas are those of the very facets."""
+    """Energy of uniform light that facets with these slopes (2, N), which are mirrors, reflect. It
+    is computed in float64 except for V, whose areas are those of the same facets."""
     m = np.concatenate([slopes, np.ones((1, slopes.shape[1]))])
     cosine = m.T @ wi  # ω·m/m_z
     m = m / np.linalg.norm(m, axis=0)

@@ -1,4 +1,4 @@
-"""Lobes of normals: densities, visible areas and visible normals, however far the mean leans."""
+"""Lobes of normals: densities, visible areas and visible normals, for any mean slope."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def slope_density(name: str, distribution: str, x: np.ndarray, y: np.ndarray) ->
 
 
 def area_by_quadrature(name: str, distribution: str, w: np.ndarray) -> float:
-    """∫ max(0, w_z + w_xy·x) P₂₂(x) dx: the marginal along w_xy has a closed form."""
+    """∫ max(0, w_z + w_xy·x) P₂₂(x) dx; the marginal of P₂₂ along w_xy has a closed form."""
     mean, (uu, vv, uv) = LOBES[name]
     a = w[2] + w[:2] @ np.array(mean)
     z = np.sqrt(uu * w[0] ** 2 + vv * w[1] ** 2 + 2 * uv * w[0] * w[1])
@@ -125,8 +125,8 @@ def test_weighed_gaussian_is_sampled_exactly(variant, a):
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 @pytest.mark.parametrize("name", LOBES)
 def test_visible_normals_are_distributed_as_their_density_says(variant, name, distribution):
-    """The distribution of slopes along two axes, and of the whole: by moments of bounded functions,
-    estimated from samples and from a quadrature with the density."""
+    """Moments of bounded functions of the slopes, along two axes and together, agree between
+    samples and a quadrature of the density."""
     lobe, count = make(name, distribution), 100_000
     u = random_numbers(count, 3, seed=6)
     mean, (uu, vv, _) = LOBES[name]
@@ -179,7 +179,7 @@ def test_visible_pdf(variant, distribution):
 
 
 def test_derivative_of_a_sample(variant):
-    """Along the inverse function, also where the mean normal faces away."""
+    """The derivative along the inverse function, also if the mean normal faces away."""
     u = mi.Float(0.3)
     for a in (-2.0, -0.5):
         x = mi.Float(a)

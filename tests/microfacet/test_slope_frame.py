@@ -107,7 +107,7 @@ def skewed() -> SlopeFrame:
 
 
 def test_densities_keep_their_integral(variant):
-    """Of a density over the disk in the map's frame, and its mean facet."""
+    """The integral of a density over the disk in the map's frame, and its mean facet, are kept."""
     frame, count = skewed(), 1500
     x, y = ((np.arange(count) + 0.5) / count * 1.9 - 0.95 for _ in range(2))
     x, y = (g.ravel() for g in np.meshgrid(x, y))

@@ -1,4 +1,4 @@
-"""The plugin glint_diffuse: what it integrates, the shared suite where it applies, its errors."""
+"""The plugin glint_diffuse: its integral, the shared suite as far as it applies, its errors."""
 
 from __future__ import annotations
 

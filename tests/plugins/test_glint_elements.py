@@ -1,4 +1,5 @@
-"""The plugin glint_elements: the shared suite for curved and flat elements and flakes; errors."""
+"""The plugin glint_elements: the shared suite for curved and flat elements and for flakes; its
+errors."""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ def load(normal_map: NormalMap = MAP, **parameters) -> mi.BSDF:
 
 
 def bounds_of(bsdf: mi.BSDF, view: View) -> suite.Bounds:
-    """A rectangle of normals that holds almost all that are seen, to resolve their spikes."""
+    """A rectangle of normals that contains almost all visible ones, to resolve their spikes."""
     si, bs, _ = suite.sample(bsdf, view, 200_000, seed=9)
     m = np.array(dr.normalize(si.wi + bs.wo))[:2]
     return tuple(m.min(axis=1) - SIGMA_R / 2), tuple(m.max(axis=1) + SIGMA_R / 2)

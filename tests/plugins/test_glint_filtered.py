@@ -1,4 +1,5 @@
-"""The plugin glint_filtered: the shared suite for each method, what each filter is, its errors."""
+"""The plugin glint_filtered: the shared suite for each method, the definition of each filter, its
+errors."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ def load(normal_map: NormalMap = MAP, **parameters) -> mi.BSDF:
 
 
 def check_chi2(bsdf: mi.BSDF, view: View, samples: int = 100_000, res: int = 25) -> None:
-    """``sample`` draws from ``pdf``. A lobe reaches the horizon: what is lost is one more bin."""
+    """``sample`` draws from ``pdf``. The lobe reaches the horizon, so invalid samples count as one
+    more bin."""
     si, bs, _ = suite.sample(bsdf, view, samples)
     m = np.array(dr.normalize(si.wi + bs.wo))[:2, np.array(bs.pdf) > 0]
     counts, _, _ = np.histogram2d(m[1], m[0], res, ((-REACH, REACH), (-REACH, REACH)))
@@ -164,7 +166,7 @@ def test_flat_map_is_a_roughconductor(variant, method, distribution):
 
 
 def slope_moments(pndf: Filtered, footprint: Footprint, count: int = 1_000_000) -> tuple:
-    """Mean and covariance of the slopes of normals drawn from the lobe."""
+    """Mean and covariance of the slopes of normals that are drawn from the lobe."""
     u = suite.random_numbers(count, 3, seed=2)
     s = np.array(pndf.sample(footprint, u[0], mi.Point2f(u[1], u[2])), np.float64)
     slopes = s / np.sqrt(1 - (s**2).sum(axis=0))
@@ -173,7 +175,8 @@ def slope_moments(pndf: Filtered, footprint: Footprint, count: int = 1_000_000) 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_moments_of_the_lobe(variant, method):
-    """Mean and variance of slopes under a footprint, by each method's definition, in float64."""
+    """Mean and variance of slopes under a footprint, by the definition of each method, in
+    float64."""
     alpha, normal_map = 0.1, maps.brushed(64, alpha=0.15, streak_length=30, angle=0.6, seed=3)
     whole = Footprint.isotropic(mi.Point2f(0.5), 1.0)
     mean, covariance = slope_moments(Filtered(normal_map, method, alpha), whole)
@@ -199,7 +202,8 @@ def test_moments_of_the_lobe(variant, method):
 
 
 def test_lean_is_the_convolved_distribution_of_a_gaussian_map(variant):
-    """Over many bumps, LEAN's lobe is the distribution of the map's normals, blurred by alpha."""
+    """Over many bumps, LEAN's lobe is the distribution of the map's normals, convolved with
+    alpha."""
     normal_map = maps.isotropic(512, alpha=0.15, correlation_length=5, seed=5)
     alpha = 0.05
     footprint = Footprint.isotropic(mi.Point2f(0.4, 0.7), 128 / 512)
@@ -223,7 +227,7 @@ def test_lean_is_the_convolved_distribution_of_a_gaussian_map(variant):
 
 
 def test_stored_variance_ignores_what_lies_between_samples(variant):
-    """At a point there is none, however rough the map."""
+    """At a point there is no variance, however rough the map is."""
     footprint = Footprint.isotropic(mi.Point2f(0.31, 0.57), 0.0)
     stored = Filtered(MAP, "variance", 0.1).lobe(footprint)
     assert np.isclose(stored.uu[0], 0.01, rtol=1e-3) and np.isclose(stored.vv[0], 0.01, rtol=1e-3)

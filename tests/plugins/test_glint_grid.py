@@ -1,4 +1,4 @@
-"""The plugin glint_grid and its P-NDF: counts, coverage, the mean surface, and life in Mitsuba."""
+"""The plugin glint_grid and its P-NDF: counts, coverage, the mean surface, and use in Mitsuba."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def load(**parameters) -> mi.BSDF:
 
 
 def beckmann(alpha_u: float = 0.3, alpha_v: float = 0.3, **_) -> mi.BSDF:
-    """The surface that ``load`` of the same parameters is on average."""
+    """The mean surface of ``load`` with the same parameters."""
     return mi.load_dict(
         {
             "type": "roughconductor",
@@ -53,14 +53,14 @@ def beckmann(alpha_u: float = 0.3, alpha_v: float = 0.3, **_) -> mi.BSDF:
 
 
 def scattered_interactions(count: int, extent: float, sigma: float, wi=(0.3, 0.1, 1), seed=1):
-    """Interactions at random places of the square [0, extent]², with round footprints."""
+    """Interactions at random positions in the square [0, extent]², with round footprints."""
     si = replace(RESOLVED, du=(sigma, 0), dv=(0, sigma), wi=wi).interaction(count)
     si.uv = extent * mi.Point2f(*suite.random_numbers(count, 2, seed))
     return si
 
 
 def relative_values(bsdf: mi.BSDF, smooth: mi.BSDF, si, wo=(0.1, -0.2, 1)) -> np.ndarray:
-    """Values of ``bsdf`` in units of the smooth surface's, channels × interactions."""
+    """Values of ``bsdf`` relative to the smooth surface, channels × interactions."""
     ctx, wo = mi.BSDFContext(), dr.normalize(mi.Vector3f(wo))
     value, expected = (
         np.array(suite.intensity(b.eval(ctx, si, wo)), np.float64) for b in (bsdf, smooth)
@@ -74,7 +74,7 @@ def relative_values(bsdf: mi.BSDF, smooth: mi.BSDF, si, wo=(0.1, -0.2, 1)) -> np
 
 
 def counts(n: float, p: float, size: int = 1 << 18) -> tuple[np.ndarray, float]:
-    """Counts for ``size`` stratified random numbers, and p as float32 has it."""
+    """Counts for ``size`` stratified random numbers, and p rounded to float32."""
     low_bits = pcg3d(dr.arange(mi.UInt32, size), 0, 0)[0] >> 18
     bits = (dr.arange(mi.UInt32, size) << 14) + low_bits
     draw = ReflectingCount(mi.Float(p)).draw(bits, mi.Float(n), mi.Bool(True))
@@ -116,7 +116,7 @@ def test_small_counts_are_exactly_binomial(variant, n, p):
 
 
 def random_footprints(count: int, seed: int = 3) -> Footprint:
-    """Of all sizes from 1e-5 to 0.1, ratios to 1:100, and directions."""
+    """Footprints of sizes from 1e-5 to 0.1, with ratios up to 1:100, in all directions."""
     u = suite.random_numbers(count, 5, seed)
     size, ratio, angle = dr.exp(-11.5 + 9.2 * u[0]), dr.exp(4.6 * u[1]), 2 * np.pi * u[2]
     s, c = dr.sincos(angle)
@@ -541,7 +541,8 @@ def test_dense_is_roughconductor(variant, integrator):
 
 
 def test_dense_is_roughconductor_in_glint_path(variant):
-    """It places its samples in the pixels' filter by itself: its noise is not that of ``path``."""
+    """The integrator places its samples in the pixels' filter itself, so its noise differs from
+    that of ``path``."""
     glints = describe(density=12.0, footprint_sigma=0.5, material="Cu")
     smooth = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3, "material": "Cu"}
     glints, smooth = render(glints, "glint_path", spp=1024), render(smooth, spp=1024)

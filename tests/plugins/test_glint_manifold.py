@@ -1,4 +1,4 @@
-"""The plugin glint_manifold: the shared suite, its own parameters, and life inside Mitsuba."""
+"""The plugin glint_manifold: the shared suite, its own parameters, and use in Mitsuba."""
 
 from __future__ import annotations
 
@@ -449,7 +449,7 @@ def test_describes_itself(variant):
 
 
 def test_level_bump_map(variant):
-    """Where Mitsuba's own frame is not a number there is no light, rather than NaN."""
+    """Where Mitsuba's own frame is NaN, there is no light rather than NaN."""
     level = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((2, 2, 1), np.float32)), "raw": True}
     glint = {"type": "glint_manifold", "data": mi.TensorXf(MAPS["isotropic"].normals)}
     bsdf = mi.load_dict({"type": "bumpmap", "texture": level, "nested": glint})

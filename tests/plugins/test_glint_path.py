@@ -1,4 +1,4 @@
-"""``glint_path``: the image of ``path``, and a footprint at every hit."""
+"""``glint_path``: it renders the image of ``path``, with a footprint at every hit."""
 
 from __future__ import annotations
 
@@ -95,12 +95,13 @@ def assert_same_image(scene, **parameters):
     ids=str,
 )
 def test_equals_path_sample_by_sample(variant, parameters):
-    """Stronger than equality in expectation: the same random numbers give the same image."""
+    """This is stronger than equality in expectation: the same random numbers give the same
+    image."""
     assert_same_image(load_scene(), **parameters)
 
 
 def test_equals_path_when_emitters_hide_others(variant):
-    """Two lamps behind one another, and alpha where only lamps were hit."""
+    """Two lamps, one behind the other, and alpha where rays hit only lamps."""
     lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": 3.0}}
     scene = load_scene(
         front={**lamp, "to_world": transform().translate([1, -3, 1.5]).rotate([1, 0, 0], 90)},
@@ -126,7 +127,7 @@ def test_parameters(variant):
 
 @pytest.mark.parametrize("key", ["rough.bsdf.alpha.value", "lamp.emitter.radiance.value"])
 def test_gradients_are_those_of_path(variant, key):
-    """Reverse mode against ``path`` with the same samples, and against forward mode."""
+    """Reverse mode agrees with ``path`` for the same samples, and with forward mode."""
     scene = load_scene()
     parameters = mi.traverse(scene)
 
@@ -155,8 +156,8 @@ def test_gradients_are_those_of_path(variant, key):
 
 
 def register_probe():
-    """A BSDF that shows what it is handed: a ray that leaves it towards an environment of radiance
-    1 carries (x, y, 1), the components of ``quantity``: duv_dx, duv_dy or uv."""
+    """A BSDF that shows its input. A ray that leaves it towards an environment of radiance 1
+    carries (x, y, 1), the components of ``quantity``: duv_dx, duv_dy or uv."""
 
     class Probe(mi.BSDF):
         def __init__(self, props):
@@ -189,7 +190,8 @@ def register_probe():
 
 
 def probe(shapes, ray, quantity, spp=1):
-    """What ``glint_path`` hands to the BSDF of ``shapes["probe"]``: (N, 2), and where (N,)."""
+    """The values that ``glint_path`` passes to the BSDF of ``shapes["probe"]``, (N, 2), and where
+    it does, (N,)."""
     register_probe()
     target = {**shapes["probe"], "bsdf": {"type": "footprint_probe", "quantity": quantity}}
     scene = mi.load_dict(
@@ -209,12 +211,12 @@ def probe(shapes, ray, quantity, spp=1):
 
 
 def partials(shapes, ray, spp=1):
-    """(N, 2, 2): columns duv_dx and duv_dy."""
+    """UV partials (N, 2, 2), with the columns duv_dx and duv_dy."""
     return np.stack([probe(shapes, ray, f"duv_d{axis}", spp) for axis in "xy"], axis=-1)
 
 
 def traced_partials(shapes, ray):
-    """The same by tracing the neighbouring rays themselves (central differences)."""
+    """UV partials from traced neighbouring rays (central differences)."""
 
     def uv_at(offset_o, offset_d):
         moved = mi.Ray3f(ray.o + offset_o, dr.normalize(ray.d + offset_d))
@@ -225,7 +227,7 @@ def traced_partials(shapes, ray):
 
 
 def sensor_rays(count):
-    """Rays of a camera above the origin, tilted, with the differentials of one pixel of 512²."""
+    """Rays of a tilted camera above the origin, with the differentials of one pixel of 512²."""
     sensor = mi.load_dict(
         {
             "type": "perspective",
@@ -240,7 +242,7 @@ def sensor_rays(count):
 
 
 def errors(actual, expected):
-    """Largest error of a matrix entry relative to the largest entry, for each ray that arrived."""
+    """Largest error of a matrix entry, relative to the largest entry, for each ray that arrived."""
     scale = np.abs(expected).max(axis=(1, 2))
     arrived = (scale > 0) & (np.abs(actual).max(axis=(1, 2)) > 0)
     assert arrived.mean() > 0.5
@@ -292,7 +294,7 @@ def bumpy_mesh(with_uv=True):
 
 @pytest.mark.parametrize("shape", ["rectangle", "sphere"])
 def test_first_hit_is_exact(variant, shape):
-    """On an oblique plane and a sphere: what compute_uv_partials gives."""
+    """On an oblique plane and on a sphere, it equals compute_uv_partials."""
     shapes = {"probe": {"type": shape, "to_world": tilted(40, 30).scale(1.5)}}
     ray = sensor_rays(200)
     scene = mi.load_dict({"type": "scene", **shapes})
@@ -305,7 +307,8 @@ def test_first_hit_is_exact(variant, shape):
 
 @pytest.mark.parametrize("bounce", ["plane", "sphere", "cylinder", "mesh", "slab", "lens", "null"])
 def test_footprint_behind_a_bounce(variant, bounce):
-    """Against the neighbouring rays, traced: mirrors of every curvature, and refraction."""
+    """It agrees with traced neighbouring rays, for mirrors of every curvature, and for
+    refraction."""
     mirror, glass = {"type": "conductor"}, {"type": "dielectric", "int_ior": 1.3}
     below = {
         "type": "rectangle",
@@ -360,7 +363,8 @@ def test_footprint_behind_a_mesh_without_uv(variant):
 
 
 def test_footprint_behind_an_instance(variant):
-    """An instanced mesh mirrors like a flat one: finite, and a footprint of the right size."""
+    """An instanced mesh reflects like a flat one: the footprint is finite and has the right
+    size."""
     group = {"type": "shapegroup", "mesh": bumpy_mesh()}
     shapes = {
         "group": group,
@@ -381,7 +385,7 @@ def test_footprint_behind_an_instance(variant):
 
 
 def test_sensor_without_differentials(variant):
-    """The cone has no width, and a mirror gives it none."""
+    """The cone has no width, and a mirror does not change this."""
     ray = sensor_rays(50)
     ray.has_differentials = False
     mirror = {"type": "rectangle", "to_world": tilted(25, 10), "bsdf": {"type": "conductor"}}
@@ -392,7 +396,7 @@ def test_sensor_without_differentials(variant):
 
 @pytest.mark.parametrize("spp", [25, 10_000])
 def test_lobe_spreads_the_cone(variant, spp):
-    """Behind a diffuse bounce a footprint covers the solid angle 1/(N pdf), pdf = cosθ/π."""
+    """After a diffuse bounce, a footprint covers the solid angle 1/(N pdf), with pdf = cosθ/π."""
     count, height, scale = 500, 2.0, 30.0
     ray = mi.RayDifferential3f(mi.Ray3f(dr.zeros(mi.Point3f, count) + [0, 0, 1], [0, 0, -1]))
     shapes = {
@@ -416,7 +420,7 @@ def test_lobe_spreads_the_cone(variant, spp):
 
 
 def test_widening_adds_to_every_axis(variant):
-    """``widened`` with a cone of any shape and orientation: widths add at a distance."""
+    """``widened`` with a cone of any shape and orientation: the widths add at a distance."""
     rng = np.random.default_rng(5)
     d, a, b = (mi.Vector3f(rng.normal(size=(3, 200)).astype(np.float32)) for _ in range(3))
     d = dr.normalize(d)
@@ -437,6 +441,6 @@ def test_widening_adds_to_every_axis(variant):
 
 
 def test_lobe_width(variant):
-    """The side of the square of solid angle 1/(N pdf), and never more than the hemisphere's."""
+    """The side of a square of solid angle 1/(N pdf), and at most that of the hemisphere."""
     width = lobe_width(mi.Float(4.0, 1e-9, 0.0), 25)
     assert np.allclose(width.numpy(), np.sqrt([1 / 100, 2 * np.pi / 25, 2 * np.pi / 25]))

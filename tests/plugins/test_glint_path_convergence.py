@@ -1,6 +1,7 @@
-"""``glint_path``: the pixel's filter shared with footprints, and every small light at every hit.
+"""``glint_path``: footprints and samples share the pixel's filter, and every small light is sampled
+at every hit.
 
-Images against those of ``path``, which knows nothing of either, in expectation.
+In expectation, images equal those of ``path``, which does neither.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ def sensor(rfilter="gaussian", size=(12, 8), **film):
 
 
 def board(**sensor_parameters):
-    """A checkerboard that shines, finer than pixels: what differs is the filter alone."""
+    """A checkerboard that emits light, finer than pixels: only the filter makes a difference."""
     squares = {"type": "checkerboard", "to_uv": transform().scale([11, 11, 1])}
     board = {"type": "rectangle", "emitter": {"type": "area", "radiance": squares}}
     return mi.load_dict({"type": "scene", "board": board, "sensor": sensor(**sensor_parameters)})
 
 
 def glints(sigma_r=0.05, **nodes):
-    """A square of small glints of a rough map: several elements under a pixel."""
+    """A square with small glints of a rough map: several elements are under a pixel."""
     normals = procedural.isotropic(64, seed=3).normals
     z = np.sqrt(1 - (normals**2).sum(-1, keepdims=True))
     data = mi.TensorXf(np.concatenate([normals, z], -1).astype(np.float32))
@@ -89,8 +90,8 @@ def images(scene, integrator, spp, count, **parameters):
 
 
 def assert_same_mean(a, b, sigmas=4.5, of_image=True, bias=0.0):
-    """Images (N, …) of one expectation: their means within so many standard errors of each other,
-    and a relative ``bias``; over the whole image less its border, or pixel by pixel."""
+    """Images (N, …) with the same expectation: their means agree within a number of standard errors
+    and a relative ``bias``, over the whole image without its border, or pixel by pixel."""
     if of_image:
         a, b = (x[:, 2:-2, 2:-2].reshape(len(x), -1).mean(1) for x in (a, b))
     error = np.sqrt(sum(x.var(0, ddof=1) / len(x) for x in (a, b)))
@@ -111,7 +112,7 @@ def assert_same_mean(a, b, sigmas=4.5, of_image=True, bias=0.0):
 
 @pytest.mark.parametrize("name", (*FILTERS, "catmullrom", "lanczos"))
 def test_samples_of_a_filter(variant, name):
-    """Moments of weighed samples are those of the profile, negative lobes included."""
+    """Moments of weighted samples are those of the filter, with its negative lobes."""
     rfilter = mi.load_dict({"type": name})
     found = PixelFilter(rfilter)
     x = np.linspace(-rfilter.radius(), rfilter.radius(), 200_001)
@@ -129,7 +130,7 @@ def test_samples_of_a_filter(variant, name):
 
 @pytest.mark.parametrize("rfilter", FILTERS)
 def test_without_footprints_the_filter_is_that_of_the_film(variant, rfilter):
-    """A share of 0: pixel by pixel the image of ``path``."""
+    """With a share of 0, the image equals that of ``path`` pixel by pixel."""
     scene = board(rfilter=rfilter)
     assert_same_mean(
         images(scene, "glint_path", 64, 24, pixel_share=0),
@@ -154,7 +155,7 @@ def test_crops_alpha_and_further_channels(variant, film):
 
 
 def test_each_variant(each_variant):
-    """Mono, spectral and polarised colours."""
+    """Monochromatic, spectral and polarised colours."""
     scene = board()
     assert_same_mean(
         images(scene, "glint_path", 64, 6, pixel_share=0), images(scene, "path", 64, 6)
@@ -185,7 +186,8 @@ def test_samplers(variant, sampler):
 
 
 def test_low_discrepancy_converges_faster(variant):
-    """16 samples in every pixel do not leave gaps: less than half the variance of chance."""
+    """16 samples per pixel leave no gaps: their variance is less than half of that of random
+    samples."""
     scene = board()
 
     def variance(spp):
@@ -195,7 +197,8 @@ def test_low_discrepancy_converges_faster(variant):
 
 
 def test_one_sample_of_the_whole_filter_has_no_noise(variant):
-    """One sample per pixel, all of the filter in the footprint, a point light: no chance left."""
+    """One sample per pixel, the whole filter in the footprint, and a point light: nothing is
+    random."""
     scene = glints(light={"type": "point", "position": [0.1, 0.2, 8], "intensity": 100.0})
     found = images(scene, "glint_path", 1, 3, max_depth=2)
     assert found.max() > 0
@@ -220,14 +223,14 @@ def test_bad_choice_of_emitters(variant):
 
 
 def test_filters_without_variance_are_not_shared(variant):
-    """The image of a pixel filter that has nothing to share is spread by the film."""
+    """If the filter has no variance to share, the film filters the image."""
     scene = board(rfilter="catmullrom")
     a = images(scene, "glint_path", 4, 1, pixel_share=0.5)
     assert np.allclose(a, images(scene, "path", 4, 1), rtol=1e-4, atol=1e-5)
 
 
 def test_one_pass_or_sixteen(variant):
-    """Footprints and places of samples know the samples of the whole image."""
+    """Footprints and positions of samples depend on the number of samples of the whole image."""
     scene = glints(light=ball_light(), integrator={"type": "glint_path", "max_depth": 2})
     camera = scene.sensors()[0]
     whole = passes.whole(camera.film())
@@ -264,7 +267,8 @@ def many_lights(count):
 
 
 def mixed_lights():
-    """Of every kind: point, spot, directional, textured rectangle, disk, mesh, environment."""
+    """Lights of every kind: point, spot, directional, textured rectangle, disk, mesh,
+    environment."""
     facing = transform().look_at([1, 1, 5], [0, 0, 0], [0, 1, 0])
     return {
         "point": {"type": "point", "position": [-1, 1, 4], "intensity": 20.0},
@@ -290,7 +294,7 @@ def mixed_lights():
 
 
 def lit_by(name):
-    """Lights, and what stands in their way."""
+    """Lights, and an obstacle in front of them."""
     return {
         "one": {"light": ball_light()},
         "many": many_lights(2 * MAX_SAMPLED),
@@ -320,8 +324,8 @@ def lit_by(name):
     [(name, "all") for name in ("one", "many", "mixed", "occluded", "mirror")] + [("mixed", "one")],
 )
 def test_mean_is_that_of_path(variant, name, emitters):
-    """Every kind of light, in shadow and in mirrors: the energy of the image is unchanged, but for
-    what footprints that are taken for flat leave out."""
+    """For every kind of light, in shadow and in mirrors, the energy of the image is the same,
+    except for the error of flat footprints."""
     scene = glints(**lit_by(name))
     depth = 4 if name == "mirror" else 3
     assert_same_mean(
@@ -332,7 +336,7 @@ def test_mean_is_that_of_path(variant, name, emitters):
 
 
 def test_each_light_of_a_few_is_sampled(variant):
-    """Four lights: their choice is noise no more."""
+    """With four lights, there is no noise from their choice."""
     scene = glints(
         **{f"l{k}": ball_light((2 * k - 3, 0, 8), 0.02, 1000.0 * 4.0**k) for k in range(4)}
     )
@@ -370,7 +374,7 @@ def test_probabilities_of_emitters(variant):
 
 
 def test_how_lights_are_seen(variant):
-    """Centre and variances of directions, against points of the lights themselves."""
+    """Centre and variances of directions agree with points of the lights themselves."""
     scene = glints(
         a=ball_light((1, 2, 8), 0.5),
         b={
@@ -407,7 +411,8 @@ def test_how_lights_are_seen(variant):
 
 
 def test_lights_without_a_view(variant):
-    """Inside a light, on its centre, of no extent, or too wide: not small, and nothing spreads."""
+    """From inside a light, from its centre, for a light without extent, or too wide a light: it is
+    not small, and has no spread."""
     scene = glints(a=ball_light((0, 0, 3), 2.9), b={"type": "point", "position": [0, 0, 3]})
     lights = SmallLights(scene)
     for z in (3.0, 2.0, 0.0):

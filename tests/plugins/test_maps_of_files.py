@@ -1,4 +1,5 @@
-"""One map in several files is one material, and what is written in a file is what Mitsuba reads."""
+"""The same map in several files gives the same material, and files are read as Mitsuba reads
+them."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ def picture(bsdf: dict) -> np.ndarray:
 
 
 def test_a_float_map_stored_from_zero_to_one(variant, tmp_path):
-    """As Poly Haven, Blender and Mitsuba's ``normalmap`` have it: not a black picture."""
+    """As in Poly Haven, Blender and Mitsuba's ``normalmap``: the image is not black."""
     xy = maps.isotropic(64, alpha=0.1, correlation_length=8).normals.astype(np.float64)
     stored = 0.5 + 0.5 * np.dstack((xy, np.sqrt(1 - (xy**2).sum(axis=2))))
     exr, png = (str(tmp_path / f"n.{suffix}") for suffix in ("exr", "png"))
@@ -47,7 +48,8 @@ def test_a_float_map_stored_from_zero_to_one(variant, tmp_path):
 
 
 def test_an_embossed_plate_of_an_obj_file(variant, tmp_path):
-    """Lit from above, as Mitsuba's ``bumpmap`` shows it, whether or not UVs are left-handed."""
+    """Lit from above, it looks as with Mitsuba's ``bumpmap``, for left-handed and for right-handed
+    UVs."""
     (tmp_path / "plate.obj").write_text(
         "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
         "f 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"

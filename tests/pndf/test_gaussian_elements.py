@@ -1,4 +1,4 @@
-"""4D Gaussians through a footprint: float32 against the definitions in NumPy's float64."""
+"""4D Gaussians under a footprint: float32 against the definitions in NumPy's float64."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RNG = np.random.default_rng
 
 
 def vectors(rng, scale, aspect=1.0, count=COUNT):
-    """Two float32 vectors per lane, an ellipse of any rotation with the given axes."""
+    """Two float32 vectors per lane: an ellipse with the given axes, in any rotation."""
     angle, roll = rng.uniform(0, 2 * np.pi, (2, count))
     axes = scale * np.stack([np.ones(count), np.broadcast_to(1 / aspect, count)])
     turned = (
@@ -82,7 +82,7 @@ def test_footprint_of_no_extent(variant):
 @pytest.mark.parametrize("sigma_r", [1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
 @pytest.mark.parametrize("slope", [0.0, 0.01, 1.0])
 def test_normals_of_stiff_lobes(variant, sigma_r, slope):
-    """Normals of curved lobes: relative error of the density where normals are found."""
+    """Normals of curved lobes: relative error of the density at normals that are drawn from it."""
     rng = RNG(2)
     footprint = vectors(rng, 10 ** rng.uniform(-2, 2, COUNT), 10 ** rng.uniform(0, 2, COUNT))
     jacobian = (slope * rng.uniform(-1, 1, (2, 2, COUNT))).astype(np.float32)
@@ -101,7 +101,8 @@ def test_normals_of_stiff_lobes(variant, sigma_r, slope):
 def appendix(d, s, jacobian, sigma_p, sigma_r):
     """The integral of Yan16, Eq. 11, by the paper's appendix, in the precision of ``d`` (2, N).
 
-    ``d``: from the element's seed to the footprint's centre; ``s``: normal less that of the seed.
+    ``d`` leads from the element's seed to the footprint's centre; ``s`` is the normal minus that of
+    the seed.
     """
     one = d.dtype.type(1)
     sigma_h, sigma_r, eye = one * np.float32(SIGMA_H), one * sigma_r, np.eye(2, dtype=d.dtype)
@@ -132,7 +133,8 @@ def appendix(d, s, jacobian, sigma_p, sigma_r):
 
 @pytest.mark.parametrize("sigma_r, slope", [(1e-2, 1.0), (1e-3, 1.0), (1e-4, 0.1), (1e-5, 0.01)])
 def test_the_papers_appendix_loses_what_ours_keeps(variant, sigma_r, slope):
-    """Its 4×4 matrices have entries like 1/σ_r²: in float32 their differences lose all digits."""
+    """Its 4×4 matrices have entries like 1/σ_r², and in float32 their differences lose all
+    digits."""
     rng = RNG(3)
     footprint = vectors(rng, 10 ** rng.uniform(-1, 1, COUNT), 10 ** rng.uniform(0, 1, COUNT))
     jacobian = (slope * rng.uniform(-1, 1, (COUNT, 2, 2))).astype(np.float32)
@@ -163,7 +165,7 @@ def test_the_papers_appendix_loses_what_ours_keeps(variant, sigma_r, slope):
 
 
 def test_general_roughness(variant):
-    """R may have any shape, as that of merged lobes."""
+    """R may be any covariance, like that of merged lobes."""
     rng = RNG(3)
     roughness = vectors(rng, 10 ** rng.uniform(-3, -1, COUNT), 50.0)
     footprint, lobe = vectors(rng, 2.0), vectors(rng, 1.0, 5.0)
@@ -187,7 +189,7 @@ def test_samples_have_the_covariance(variant):
 
 @pytest.mark.parametrize("aspect", [1, 10, 1000])
 def test_lattice_mass(variant, aspect):
-    """The closed form against the sum itself."""
+    """The closed form agrees with the sum itself."""
     rng = RNG(5)
     count = 20
     for scale in (0.0, 0.05, 0.3, 1.0):

@@ -1,4 +1,5 @@
-"""The example of the page "Write your own P-NDF" passes the shared suite; and the register."""
+"""The example of the page "Write your own P-NDF" passes the shared suite; the register of
+P-NDFs."""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ def test_is_rendered_and_told_from_the_register(waves):
 
 
 def test_turn_and_spread_of_a_query(waves):
-    """A turn takes the Jacobian away, a spread adds its covariance: the normals' own variance."""
+    """A turn removes the Jacobian, and a spread adds its covariance: the variance of the normals is
+    known."""
     from glintbsdf import Footprint
     from glintbsdf.footprint.query import Query
 
@@ -105,7 +107,7 @@ def test_the_register_refuses_what_lacks_a_part_or_has_a_name_twice(variant):
 
 
 def test_every_method_keeps_the_contract(variant):
-    """Made from the register, each is finite, not negative, and tells its bytes."""
+    """Every method of the register is finite and not negative, and reports its memory."""
     from glintbsdf import Footprint, maps
 
     normal_map = maps.isotropic(64, alpha=0.2)

@@ -1,4 +1,4 @@
-"""Rendering by many processes: the same image, to the last bit, whatever happens to them."""
+"""Rendering by many processes: the image is the same to the last bit, whatever happens to them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ UNITS = 24
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> Path:
-    """A folder, made the current one, with a small scene in it and its map."""
+    """The current folder, with a small scene and its map in it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(units, "FEWEST", 512)
     (tmp_path / "scene.xml").write_text(SCENE)
@@ -72,7 +72,7 @@ def job(folder: Path, variant: str) -> Job:
 
 @pytest.fixture(scope="module")
 def two() -> Cluster:
-    """Two processes, for all tests that leave them alive."""
+    """Two processes, for all tests that do not end them."""
     with Cluster.local(2, tell=print) as cluster:
         yield cluster
 
@@ -113,7 +113,7 @@ def test_options(job, two, changes, folder):
 
 @pytest.mark.parametrize("colours", ["spectral", "spectral_polarized"])
 def test_other_variants(job, two, variant, colours):
-    """A worker changes its variant as well."""
+    """A worker changes its variant, too."""
     backend = variant.split("_")[0]
     mi.set_variant(f"{backend}_ad_{colours}")
     job = replace(job, variant=mi.variant())
@@ -121,7 +121,7 @@ def test_other_variants(job, two, variant, colours):
 
 
 def test_a_killed_worker(job):
-    """SIGKILL in the middle: its units go to the others, and it is replaced."""
+    """SIGKILL during rendering: other workers get its units, and it is replaced."""
     with Cluster.local(3) as cluster:
         before = set(pids(cluster))
         merged = []
@@ -156,7 +156,7 @@ def test_workers_of_unequal_speed(job):
 
 
 def test_files_are_sent_where_they_are_not(job, two):
-    """As to another machine: no path of the sender exists there."""
+    """As if to another machine, where no path of the sender exists."""
 
     def away(group):
         return tuple((name, replace(content, path="/nowhere")) for name, content in group)
@@ -219,7 +219,7 @@ def test_until_noise(job, two):
 
 
 def no_more_than(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let workers have no memory for units of more than ``most`` samples."""
+    """Make workers lack memory for units of more than ``most`` samples."""
     original = clusters.packed
 
     def packed(job: Job, unit: units.Unit) -> bytes:
@@ -231,7 +231,7 @@ def no_more_than(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_unit_that_is_too_large_is_halved(job, two, capsys, monkeypatch):
-    """To half of its samples: another image of the same light."""
+    """It is halved once, and the image has different noise, but the same light."""
     no_more_than(256, monkeypatch)
     halved = image(job, two)
     assert "halved, so that the noise of the image is another" in capsys.readouterr().out
@@ -248,7 +248,7 @@ def test_a_scene_that_is_too_large_is_told(job, two, monkeypatch):
 
 
 def test_sums_of_halves():
-    """Tiles of halves may overlap by the filter's reach, or be the same."""
+    """Tiles of halves may overlap by the filter's reach, or be equal."""
     first, second = Tile(2, 3, 4, 2), Tile(2, 4, 4, 3)
     both, sums = clusters._sum(
         [(first, np.full((2, 4, 1), 1.0)), (second, np.full((3, 4, 1), 2.0))]
@@ -309,7 +309,7 @@ def test_a_warning_without_tls(address, warned, monkeypatch):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_a_local_cluster_listens_on_loopback_only(two):
-    """Scheduler, nannies, workers, and their dashboards."""
+    """This holds for scheduler, nannies, workers, and their dashboards."""
     owners = {os.getpid(), *pids(two), *two.client.run(os.getppid).values()}
     children = subprocess.run(
         ["ps", "-o", "pid=", "--ppid", str(os.getpid())], capture_output=True, text=True
@@ -384,7 +384,7 @@ class Scheduler:
 
 
 def test_a_killed_scheduler(job, folder, tmp_path):
-    """An error, and the same command goes on from its checkpoint with another scheduler."""
+    """The command ends with an error, and continues from its checkpoint with another scheduler."""
 
     def kept() -> Checkpoint:
         return Checkpoint(tmp_path / "kept", job.description())
@@ -437,7 +437,7 @@ def elsewhere(tmp_path: Path) -> Path:
 
 
 def worker_there(scheduler: Scheduler) -> None:
-    """Wait until the worker of a scheduler has come."""
+    """Wait until a scheduler has its worker."""
     from distributed import Client
 
     with Client(scheduler.address, timeout=60) as client:
@@ -461,7 +461,7 @@ def test_a_worker_without_the_package(job, tmp_path, elsewhere):
 
 
 def test_a_scheduler_without_the_package(job, tmp_path, elsewhere):
-    """It needs none."""
+    """The scheduler does not need the package."""
     scheduler = Scheduler(tmp_path, scheduler_path=elsewhere)
     try:
         with Cluster.at(scheduler.address, tell=print) as cluster:
@@ -472,7 +472,7 @@ def test_a_scheduler_without_the_package(job, tmp_path, elsewhere):
 
 @pytest.fixture
 def keys(tmp_path: Path) -> Keys:
-    """A certificate of an authority of its own, for scheduler, worker and client alike."""
+    """A certificate from a private authority, for scheduler, worker and client."""
     if shutil.which("openssl") is None:
         pytest.skip("there is no openssl to make certificates")
 
@@ -488,7 +488,8 @@ def keys(tmp_path: Path) -> Keys:
 
 
 def test_tls(job, keys, tmp_path):
-    """The same image; who has no key, or another authority's, gets no answer."""
+    """The image is the same; a client without a key, or with one of another authority, gets no
+    answer."""
     files = ("--tls-ca-file", keys.ca_file, "--tls-cert", keys.cert, "--tls-key", keys.key)
     scheduler = Scheduler(tmp_path, *map(str, files), "--protocol", "tls", scheme="tls")
     try:

@@ -1,4 +1,4 @@
-"""Structures are built late where a scene is loaded for that, whatever thread makes a plugin."""
+"""Scenes that are loaded deferred build their structures late, whatever thread makes a plugin."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KINDS = {
 
 @pytest.fixture
 def scene_file(variant, tmp_path):
-    """Eight materials, two of each kind, nested and not: Mitsuba makes them in parallel."""
+    """Eight materials, two of each kind, nested and not; Mitsuba makes them in parallel."""
     normals = maps.isotropic(64, alpha=0.2).normals
     z = np.sqrt(1 - (normals**2).sum(axis=2, keepdims=True))
     pixels = np.concatenate([normals, z], axis=2).astype(np.float32)
@@ -71,7 +71,7 @@ def test_the_order_in_which_plugins_are_made_does_not_matter(scene_file):
 
 
 def test_scenes_loaded_one_within_the_other_do_not_disturb_each_other(scene_file):
-    """No state of a module decides what is built: an ordinary BSDF is built at once meanwhile."""
+    """No state of a module decides what is built: an ordinary BSDF in between is built at once."""
     deferred = inspection.load(scene_file)
     data = mi.TensorXf(maps.isotropic(16).normals)
     ordinary = mi.load_dict({"type": "glint_manifold", "data": data})
@@ -83,7 +83,8 @@ def test_scenes_loaded_one_within_the_other_do_not_disturb_each_other(scene_file
 
 
 def test_a_structure_asked_outside_of_its_domain_tells(scene_file):
-    """The gate of a trimmed BSDF sees what was not built for; it is never answered wrongly."""
+    """The gate of a trimmed BSDF notices queries that it was not built for, and they are never
+    answered wrongly."""
     inspected = inspection.load(scene_file)
     domains = [Domain((30, 33), (30, 33), 0.5, 0.6)] * len(inspected.bsdfs)
     inspection.build_trimmed(inspected, domains)

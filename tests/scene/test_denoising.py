@@ -1,4 +1,4 @@
-"""Denoising: of indirect light only, and what it needs."""
+"""Denoising of indirect light only, and its requirements."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def pixels(bitmap: mi.Bitmap) -> np.ndarray:
 
 @needs_denoiser
 def test_direct_light_stays_as_it_is(variant, monkeypatch):
-    """Without what the denoiser returns there is the direct image, glints and all."""
+    """The image minus the denoiser's output is the direct image, with all glints."""
     _, direct, _ = parts(glinting_room(), spp=4, max_depth=6)
     monkeypatch.setattr(denoising, "denoise", lambda radiance, albedo, normal: 0 * radiance)
     monkeypatch.setattr(units, "FEWEST", 1 << 30)  # the seed as it is
@@ -47,7 +47,7 @@ def test_direct_light_stays_as_it_is(variant, monkeypatch):
 
 @needs_denoiser
 def test_error_of_indirect_light_falls(variant, monkeypatch):
-    """Against a reference of 32 times as many samples; the mean is kept."""
+    """Against a reference with 32 times as many samples; the mean is kept."""
     noisy = []
     original = denoising.denoise
 
@@ -71,7 +71,7 @@ def test_error_of_indirect_light_falls(variant, monkeypatch):
 
 @needs_denoiser
 def test_guides_are_those_of_the_visible_surfaces(variant, monkeypatch):
-    """The albedo is free of glints, and normals are those of the shapes."""
+    """The albedo has no glints, and normals are those of the shapes."""
     guides = []
     monkeypatch.setattr(
         denoising, "denoise", lambda radiance, *images: guides.append(images) or radiance
@@ -118,7 +118,7 @@ def test_missing_denoiser(variant, monkeypatch):
 
 @needs_denoiser
 def test_sheet_of_the_parts(variant, tmp_path):
-    """The script that shows what is denoised, with the scene made for it."""
+    """The script for contact sheets, with the scene that is made for it."""
     spec = importlib.util.spec_from_file_location("sheets", SCENES / "sheets.py")
     sheets = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sheets)

@@ -1,4 +1,4 @@
-"""Merging: the same image whatever the order of units, and what a checkpoint keeps of it."""
+"""Merging: the image does not depend on the order of units; the contents of a checkpoint."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIGMA = 0.5
 
 @pytest.fixture
 def plan(variant, monkeypatch) -> Plan:
-    """Of 40 passes, each of two tiles: 80 units."""
+    """A plan with 40 passes of two tiles each: 80 units."""
     monkeypatch.setattr(units, "FEWEST", 4 * 96)
     monkeypatch.setattr(units, "MOST", 4 * 48)
     plan = Plan(FILM, 160, 0, stratified=False)
@@ -31,7 +31,7 @@ def plan(variant, monkeypatch) -> Plan:
 
 
 def sums_of(unit) -> np.ndarray:
-    """Colours of mean 1 and a known deviation, and weights: a function of the unit alone."""
+    """Colours of mean 1 and a known deviation, and weights; they depend on the unit only."""
     random = np.random.default_rng(unit.seed)
     shape = (unit.tile.height, unit.tile.width, 3)
     colours = 1 + random.normal(scale=SIGMA, size=(unit.spp, *shape)).astype(np.float32)
@@ -40,7 +40,7 @@ def sums_of(unit) -> np.ndarray:
 
 
 class Workers:
-    """Renders units in batches, each in another order; counts them."""
+    """Renders units in batches, each in another order, and counts them."""
 
     def __init__(self, batch: int = 1, order: int = 0, die_after: int | None = None) -> None:
         self.batch, self.die_after = batch, die_after
@@ -117,7 +117,7 @@ def test_a_black_image_has_no_relative_noise(plan):
 
 @pytest.mark.parametrize("batch", [1, 9, 80])
 def test_until_noise_ends_at_the_same_pass(plan, batch):
-    """Whatever has been rendered by then."""
+    """It does not depend on the units that are rendered by then."""
     wanted = SIGMA / 60**0.5
     image = image_of(plan, Workers(batch, batch), until_noise=wanted)
     assert image.noise <= wanted and image.count % 2 == 0

@@ -1,4 +1,4 @@
-"""One pass: Mitsuba's samples, added up the same way every time."""
+"""One pass: Mitsuba's samples, summed in a fixed order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scene(
     spp: int = 8,
     sensor: dict | None = None,
 ) -> mi.Scene:
-    """A rough plate, partly in front of the sky, of 24 × 16 pixels."""
+    """A rough plate, partly in front of the sky, with 24 × 16 pixels."""
     return mi.load_dict(
         {
             "type": "scene",
@@ -65,7 +65,7 @@ def ours(loaded: mi.Scene, spp: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("rfilter", FILTERS)
 def test_the_image_is_mitsubas(variant, rfilter):
-    """The same samples under the same filter, which Mitsuba looks up in a table."""
+    """The samples and the filter are the same, but Mitsuba looks up the filter in a table."""
     loaded = scene(rfilter)
     expected = mitsubas(loaded, 8, 3)
     tolerance = 1e-6 if rfilter == "box" else 0.02 * expected.max()
@@ -100,7 +100,7 @@ def test_colours_of_other_variants(each_variant):
 
 
 def test_an_integrator_without_camera_rays(variant):
-    """ptracer spreads particles over the image; of its passes the mean is taken as well."""
+    """ptracer distributes particles over the image; its passes are averaged as well."""
     integrator = {"type": "ptracer", "max_depth": 3, "hide_emitters": True}
     loaded = scene("box", integrator=integrator)
     assert ours(loaded, 64, 1).mean() == pytest.approx(mitsubas(loaded, 64, 1).mean(), rel=1e-4)
@@ -108,8 +108,8 @@ def test_an_integrator_without_camera_rays(variant):
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_last_bits_do_not_depend_on_threads(variant, rfilter):
-    """7 samples: where the work of a thread ends, a pixel's does not. Mitsuba's own images differ
-    from run to run here."""
+    """With 7 samples, the work of a thread ends within a pixel. Mitsuba's own images differ from
+    run to run here."""
     loaded = scene(rfilter, film={"width": 150, "height": 100}, spp=7)
     count = dr.thread_count()
     images = []
@@ -125,7 +125,7 @@ def test_last_bits_do_not_depend_on_threads(variant, rfilter):
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 @pytest.mark.parametrize("most", [8 * 24 * 5, 8 * 7])
 def test_tiles_make_the_whole(variant, rfilter, most, monkeypatch):
-    """Bands, and parts of rows: in the mean the image of one piece, and no seams."""
+    """Bands and parts of rows have the same mean as one piece, without seams."""
     loaded = scene(rfilter)
     whole = np.mean([np.array(rendering.render(loaded, 8, seed)) for seed in range(8)], axis=0)
     monkeypatch.setattr(units, "MOST", most)

@@ -1,4 +1,5 @@
-"""Scenes that travel: complete, by content, and never out of the receiver's folder."""
+"""Scenes that are sent: they are complete, identified by content, and never leave the receiver's
+folder."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ CAMERA = """<scene version="3.0.0">
 
 @pytest.fixture
 def folder(tmp_path: Path, variant) -> Path:
-    """A scene whose files lie beside it, above it, and in a folder of their own."""
+    """A scene whose files are beside it, above it, and in another folder."""
     root = tmp_path / "sender"
     for name in ("scenes", "maps", "parts"):
         (root / name).mkdir(parents=True)
@@ -65,7 +66,7 @@ def sent(made: Package, store: Store) -> None:
 
 
 def elsewhere(made: Package) -> Package:
-    """The package as on a machine that has none of the owner's files."""
+    """The package as on a machine that has none of the sender's files."""
     return replace(
         made,
         documents=tuple((n, replace(c, path="/nowhere" + c.path)) for n, c in made.documents),

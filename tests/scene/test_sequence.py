@@ -179,7 +179,7 @@ def test_a_video_needs_ffmpeg(run, folder, monkeypatch):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell script stands for ffmpeg")
 def test_what_ffmpeg_gets(run, folder, monkeypatch):
-    """A program in its place keeps what it is given."""
+    """A program in place of ffmpeg records its input."""
     program = folder / "bin" / "ffmpeg"
     program.parent.mkdir()
     program.write_text('#!/bin/sh\nfor last; do :; done\necho "$@" > arguments\ncat > "$last"\n')

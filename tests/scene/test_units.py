@@ -1,4 +1,4 @@
-"""The plan of an image: complete, disjoint, of bounded units, and the same for everybody."""
+"""The plan of an image: complete, disjoint, of bounded units, and the same in every process."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_plan_ends():
 
 @pytest.mark.parametrize("stratified", [False, True])
 def test_halves_are_the_unit(variant, stratified):
-    """Down to one sample, or the samples of one pixel, no pixel is lost."""
+    """No pixel is lost, down to one sample, or to the samples of one pixel."""
     unit = Plan(Tile(2, 3, 5, 4), 6, 0, stratified)[0]
     parts, single = [unit], []
     while parts:

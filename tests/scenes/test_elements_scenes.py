@@ -60,7 +60,7 @@ def test_glints_where_a_smooth_material_has_none(variant, name, tmp_path):
 
 
 def test_strategies_of_the_textured_light(variant):
-    """Both together are nearer to what there is to see than either."""
+    """Both strategies together are closer to the converged image than each of them."""
 
     def images(bsdf_samples: int, emitter_samples: int, spp: int, seeds: range) -> np.ndarray:
         scene = load(

@@ -1,4 +1,5 @@
-"""The scenes of glint_grid: they load and glint, and the animation ends up on one sheet."""
+"""The scenes of glint_grid: they load and glint, and the script makes a contact sheet of an
+animation."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ SIZE, SPP = 60, 16
 
 
 def render(name: str, **parameters: str) -> np.ndarray:
-    """Luminance, in logarithms, of the window of the scene ``name``."""
+    """Logarithm of the luminance in the window of an image of the scene ``name``."""
     fov, (top, bottom, left, right) = CASES[name]
     scene = mi.load_file(
         str(SCENES / f"{name}.xml"),

@@ -1,4 +1,5 @@
-"""The scenes of the README and the documentation: they load, they glint, the script makes them."""
+"""The scenes of the README and of the documentation: they load, they glint, and the script makes
+them."""
 
 import importlib.util
 import math
@@ -44,9 +45,10 @@ def load(filename, **parameters):
 
 
 def repeatability(scene, window):
-    """Correlation, between two renders of independent seeds, of what differs from pixel to pixel.
+    """Correlation of the differences between neighbouring pixels, for two renders with independent
+    seeds.
 
-    Glints stand where the map puts them and repeat; the noise of a smooth highlight does not.
+    Glints have fixed positions on the map and repeat; the noise of a smooth highlight does not.
     """
     details = []
     for seed in (1, 2):
@@ -101,7 +103,7 @@ def test_parameters_override_the_defaults(variant, case):
 
 
 def test_assets_are_what_the_script_makes(tmp_path):
-    """The script reproduces the committed files, up to the rounding of another machine's libm."""
+    """The script reproduces the committed files, except for rounding by another machine's libm."""
     spec = importlib.util.spec_from_file_location("make_assets", SCENES / "make_assets.py")
     make_assets = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make_assets)
@@ -137,7 +139,7 @@ def test_assets_are_what_the_script_makes(tmp_path):
 
 
 def read_ply(filename):
-    """Vertices (N, 8) and the bytes of the faces of a PLY that the script wrote."""
+    """Vertices (N, 8) and the bytes of the faces of a PLY file that the script wrote."""
     header, _, body = filename.read_bytes().partition(b"end_header\n")
     count = int(re.search(rb"element vertex (\d+)", header)[1])
     return np.frombuffer(body, "<f4", 8 * count).reshape(count, 8), body[32 * count :]

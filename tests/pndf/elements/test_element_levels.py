@@ -1,4 +1,4 @@
-"""Spread normals and turning half vectors: in elements, and in the coarse elements of levels."""
+"""Queries with a spread of normals and a turn of the half vector: elements, and merged elements."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def moments(density, m, area):
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 6.0])
 def test_spread_is_roughness(variant, sigma):
-    """The P-NDF averaged over a Gaussian is that of rougher elements."""
+    """The P-NDF averaged over a Gaussian equals that of rougher elements."""
     spread = 0.02
     m, _ = grid()
     of_spread = Elements(smooth_map(), 0.02)
@@ -65,7 +65,7 @@ def test_spread_is_roughness(variant, sigma):
 @pytest.mark.parametrize("sigma", [0.5, 1.0])
 @pytest.mark.parametrize("curved", [True, False])
 def test_turn_is_that_of_the_map(variant, sigma, curved):
-    """A half vector that turns by H (u − u₀) sees what a fixed one sees of n(u) − H (u − u₀)."""
+    """With a half vector that turns by H (u − u₀), D is that of the map n(u) − H (u − u₀)."""
     size, u0, v0 = 64, 0.48, 0.53
     turn = np.array([[1.5, -0.7], [0.4, 0.9]])
     original = smooth_map(size, "clamp")
@@ -90,7 +90,8 @@ def test_turn_is_that_of_the_map(variant, sigma, curved):
 
 
 def test_wide_turns_lose_no_mass(variant):
-    """Lists do not reach as far as the half vector turns over a large footprint: levels do."""
+    """Over a large footprint, the half vector turns farther than lists reach; merged elements keep
+    the mass."""
     m, area = grid()
     query = Query(footprint(0.48, 0.53, 3.0), turn=mi.Matrix2f(1.5, -0.7, 0.4, 0.9))
     elements = Elements(smooth_map(), 0.02)
@@ -101,7 +102,7 @@ def test_wide_turns_lose_no_mass(variant):
 
 
 def test_samples_of_spread_and_turn(variant):
-    """Drawn from the density: mean and covariance."""
+    """Samples have the density D: mean and covariance agree."""
     elements = Elements(smooth_map(), 0.02)
     turn = mi.Matrix2f(1.5, -0.7, 0.4, 0.9)
     query = Query(footprint(0.3, 0.6, 0.5), turn, isotropic(0.03))
@@ -117,11 +118,12 @@ def test_samples_of_spread_and_turn(variant):
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 @pytest.mark.parametrize(("sigma", "spread"), [(1.0, 0.03), (6.0, 0.03), (6.0, 0.1)])
 def test_levels_keep_moments(variant, wrap_mode, sigma, spread):
-    """Against elements with the same spread: mass, and nearly mean and covariance, and D itself.
+    """Merged elements against elements with the same spread: mass, almost the mean and the
+    covariance, and D itself.
 
-    A merged element is linear over its extent, which is as wide as the spread allows: it counts for
-    the smallest of these footprints. Beyond the border of
-    a clamped map there are only those at the border: the second place is left out.
+    A merged element is linear over its extent, which is as wide as the spread allows; this counts
+    for the smallest of these footprints. Beyond the border of a clamped map there are only the
+    elements at the border, so the second place is left out.
     """
     normal_map = smooth_map(64, wrap_mode)
     levels = Levels(mi.TensorXf(normal_map.normals), wrap_mode)
@@ -141,7 +143,7 @@ def test_levels_keep_moments(variant, wrap_mode, sigma, spread):
 
 
 def test_levels_of_a_tilted_plane(variant):
-    """Normals that are linear in position: exact at every level, but for the kernel's cut."""
+    """Normals that are linear in position are exact at every level, except for the kernel's cut."""
     size = 64
     u, v = np.meshgrid(*[np.arange(size) - 31.5] * 2)
     slope = np.array([[0.012, 0.0], [0.003, 0.004]])
@@ -162,7 +164,7 @@ def test_levels_of_a_tilted_plane(variant):
 
 
 def test_levels_of_odd_and_thin_maps(variant):
-    """Any size has levels, down to one element: finite, of mass one."""
+    """Maps of any size have levels, down to one element; D is finite, and its mass is one."""
     for shape in ((1, 1), (3, 7), (1, 50), (33, 20)):
         normals = 0.2 * np.random.default_rng(1).random((*shape, 2), dtype=np.float32)
         levels = Levels(mi.TensorXf(normals), "repeat")
@@ -177,7 +179,8 @@ def test_levels_of_odd_and_thin_maps(variant):
 
 
 def test_wide_spreads_use_merged_elements(variant):
-    """As soon as they are prepared for; a spread within the roughness is not."""
+    """Merged elements serve as soon as they are prepared, but not for a spread within the
+    roughness."""
     elements = Elements(procedural.isotropic(64), 0.01)
     elements.prepare_for_lights()
     parts = elements.parts()
@@ -192,7 +195,7 @@ def test_wide_spreads_use_merged_elements(variant):
 
 
 def test_derivatives_flow_through_levels(variant):
-    """With respect to the map: against differences."""
+    """Derivatives with respect to the map agree with differences."""
     normals = smooth_map(16).normals
     m, query = mi.Vector2f(0.05, -0.02), Query(footprint(0.4, 0.6, 4, 16), spread=isotropic(0.1))
 

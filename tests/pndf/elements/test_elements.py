@@ -46,7 +46,7 @@ def draw(pndf, seen, count, seed=1):
 
 
 def mixture(normal_map, step, sigma_r, curved, m, sigma_p):
-    """D(m) from its definition: all seeds near ``UV``, in texels, float64; m is (N, 2)."""
+    """D(m) by its definition: all seeds near ``UV``, in texels, float64; m is (N, 2)."""
     size = normal_map.width
     centre = np.array(UV) * size - 0.5
     offset = min(step, 1) / 2
@@ -130,7 +130,7 @@ def reference_of(name):
 
 
 def binned_error(name, step, curved=True, points=3):
-    """Relative L1 difference to the reference, its noise of 1 % included."""
+    """Relative L1 difference to the reference, with its noise of 1 %."""
     normal_map, reference = reference_of(name)
     pndf, res = Elements(normal_map, 0.005, step, curved), len(reference.density)
     (x0, y0), (x1, y1) = reference.bounds
@@ -143,7 +143,8 @@ def binned_error(name, step, curved=True, points=3):
 
 
 def test_binned_reference(variant):
-    """3 % are allowed at half a texel, and the error falls with the step; flat elements are far."""
+    """The error is below 3 % at half a texel, and falls with the step; flat elements have a large
+    error."""
     coarse, middle, fine = (binned_error("isotropic", h) for h in (2, 1, 0.5))
     # Measured: 16 %, 5.6 %, 2 %, of which 1 % is noise.
     assert fine < 0.03 and middle < 0.08
@@ -186,7 +187,8 @@ PNDFS = {
 
 @pytest.mark.parametrize("name", PNDFS)
 def test_integral_is_one(variant, name):
-    """Within 1e-3, everywhere: ripple of W (5e-4) and the cut of normals (4.3e-4) together."""
+    """∫D is 1 within 1e-3 everywhere, with the ripple of W (5e-4) and the cut of normals
+    (4.3e-4)."""
     pndf = PNDFS[name]()
     for sigma, aspect in ((0, 1), (0.05, 1), (0.3, 1), (0.7, 1), (1.4, 1), (3, 1), (0.05, 60)):
         assert abs(integral(pndf, footprint(sigma, aspect=aspect), 0.01) - 1) < 1e-3, (
@@ -201,7 +203,8 @@ def test_footprint_larger_than_the_map(variant):
 
 
 def test_lists_leave_out_little(variant, monkeypatch, tune):
-    """All cells against the lists, for the same cut: at most what NORMAL_REACH says."""
+    """All cells against the lists, for the same cut: the lists miss at most the mass beyond
+    NORMAL_REACH."""
     pndf = Elements(MAP, 0.01, 0.5)
     monkeypatch.setattr(elements, "cut_of_sums", lambda sigma, _: elements.cut_of_lists(sigma))
     seen = footprint(1.5)
@@ -288,7 +291,8 @@ def test_flakes_have_the_roughness_asked_for(variant):
 
 
 def test_memory(variant):
-    """A 2048² map may take 1120 MB at half a texel, a quarter at one; it takes half of that."""
+    """The paper's 2048² map takes 1120 MB at half a texel, and a quarter at one texel; here it
+    takes less than half."""
     normal_map = maps.isotropic(256, seed=1)
     share = (2048 / 256) ** 2
     assert Elements(normal_map, step=0.5).nbytes * share < 560e6

@@ -1,4 +1,4 @@
-"""The hand-over from a P-NDF to its smooth limit."""
+"""The transition from a P-NDF to its smooth limit."""
 
 from __future__ import annotations
 

@@ -21,14 +21,14 @@ MAPS = {
 
 
 def pyramid(normal_map: NormalMap, **options) -> moments.MomentPyramid:
-    """LEAN's: slopes, and their covariance."""
+    """The pyramid of LEAN: slopes and their covariance."""
     data = mi.TensorXf(normal_map.normals)
     return moments.MomentPyramid(data, normal_map.wrap_mode, slope, spread=COVARIANCE, **options)
 
 
 def averages(chain: moments.MomentPyramid, uv, axes) -> np.ndarray:
-    """Means, and mean squares and products, under footprints: ``uv`` N×2; ``axes`` N×2×2 of columns
-    du, dv in texels."""
+    """Means, mean squares and mean products under footprints: ``uv`` is N×2, ``axes`` is N×2×2 with
+    the columns du, dv in texels."""
     size = np.array([chain.width, chain.height])[:, None]
     du, dv = np.float32(axes / size).transpose(2, 1, 0)
     footprint = Footprint(mi.Point2f(np.float32(uv).T), mi.Vector2f(du), mi.Vector2f(dv))
@@ -37,7 +37,8 @@ def averages(chain: moments.MomentPyramid, uv, axes) -> np.ndarray:
 
 
 def relative_errors(normal_map: NormalMap, got: np.ndarray, wanted: np.ndarray):
-    """Errors of first moments over the root mean square slope, of second ones over its square."""
+    """Errors of first moments over the root mean square slope, and of second moments over its
+    square."""
     alpha = np.linalg.norm(normal_map.roughness())
     mean_square = alpha**2 / 2
     error = np.abs(got - wanted)
@@ -45,7 +46,7 @@ def relative_errors(normal_map: NormalMap, got: np.ndarray, wanted: np.ndarray):
 
 
 def footprints(count: int, major: float, minor: float, seed: int = 4):
-    """Random places, and axes in random directions."""
+    """Random positions, and axes in random directions."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, np.pi, count)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -129,7 +130,8 @@ def test_constant_map(variant):
 
 
 def test_small_variances_keep_their_digits(variant):
-    """About a mean 10⁴ times as large as the deviation: squares would differ in the last digit."""
+    """The mean is 10⁴ times as large as the deviation: squares would differ only in their last
+    digit."""
     slopes = 1 + 1e-4 * np.random.default_rng(1).standard_normal((16, 16, 2))
     normals = np.float32(slopes / np.sqrt(1 + (slopes**2).sum(axis=2, keepdims=True)))
     s = normals.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Clusters of the manifold: their fit, their cuts, and what P-NDF and BSDF make of them."""
+"""Clusters of the manifold: their fit, their cuts, and the P-NDF and BSDF with clusters."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_fit_is_exact_where_the_map_is_linear():
 
 
 def test_fit_keeps_the_fold_along_the_diagonal():
-    """Two planes that meet in the cluster's diagonal are the cluster."""
+    """A cluster represents two planes exactly if they meet in its diagonal."""
     i, j = np.indices((9, 9))
     fold = np.abs(i + j - 8)
     vertices = np.stack([0.01 * j + 0.004 * fold, 0.01 * i - 0.002 * fold], -1)
@@ -67,7 +67,7 @@ def test_fit_keeps_the_fold_along_the_diagonal():
 
 @pytest.mark.parametrize("epsilon", [1e-6, 1e-12, 0.01])
 def test_fit_minimises_eq_7(epsilon):
-    """Against a dense quadrature of Eq. 7 and its least-squares solution, cluster by cluster."""
+    """Each cluster agrees with the least-squares solution of a dense quadrature of Eq. 7."""
     normals = maps.isotropic((10, 12), seed=3).normals.astype(np.float64)
     vertices = vertices_of(normals)
     vertices[4:7, 4:7] = 0.1  # flat: the Jacobian is clamped
@@ -171,7 +171,7 @@ COARSE = 10.0
 
 
 def footprints(normal_map, count, seed=2):
-    """Rotated ones of 0.5 to 20 texels, anywhere up to two maps away."""
+    """Rotated footprints of 0.5 to 20 texels, at most two maps away."""
     rng = np.random.default_rng(seed)
     sigma = np.exp(rng.uniform(np.log(0.5), np.log(20), (2, count)))
     turn = 2 * np.pi * rng.random(count)
@@ -191,7 +191,7 @@ def draw(pndf, footprint, count, seed=3):
 
 
 class WithinQuad:
-    """A kernel that sees one quad only; offsets are in units of an element's side."""
+    """A kernel that is restricted to one quad; offsets are in units of an element's side."""
 
     def __init__(self, kernel, side, corner) -> None:
         self.kernel, self.side, self.corner = kernel, side, corner
@@ -203,7 +203,8 @@ class WithinQuad:
 
 
 def sum_over_quads(pndf, m, footprint):
-    """D from every quad under the kernel's box, each with its part of its element: no lists."""
+    """D from every quad in the kernel's box, each with its part of its element; no lists are
+    used."""
     kernel = pndf.texel_kernel(footprint)
     rung = pndf.rung(kernel)
 
@@ -254,7 +255,7 @@ def mass(pndf, footprint, bounds, res=128, repetitions=4):
 
 @pytest.mark.parametrize("name", MAPS)
 def test_every_cut_has_mass_one(variant, name):
-    """Also for a footprint larger than the map, and far outside of one that is clamped."""
+    """Also for a footprint larger than the map, and far outside of a clamped map."""
     normal_map = MAPS[name]
     pndf = ClusteredManifold(normal_map, COARSE, epsilon=1e-3)
     triangles = pndf.vertices.numpy().reshape(-1, 2)  # clusters may reach beyond the map's normals
@@ -278,7 +279,7 @@ def test_a_small_threshold_is_exact(variant):
 
 
 def test_highlight_of_a_flat_map_keeps_its_size(variant):
-    """Clusters without error are used at any threshold; theirs are clamped triangles, too."""
+    """Clusters without error are used at any threshold; their triangles are clamped, too."""
     pndf = ClusteredManifold(maps.flat(64), 1e-12)
     footprint = footprints(maps.flat(64), 2000)
     assert pndf.rung(pndf.texel_kernel(footprint)).numpy().max() == len(pndf.ladder.thresholds)
@@ -328,7 +329,7 @@ def test_threshold_must_be_positive(variant, threshold):
 
 
 def test_memory(variant):
-    """34 MB are allowed for the clusters of 1024², besides the exact structure."""
+    """The clusters of 1024² may take 34 MB, besides the exact structure."""
     normal_map = maps.isotropic(1024, seed=1)
     assert ClusteredManifold(normal_map, 1e-2).nbytes - Manifold(normal_map).nbytes <= 34e6
 
@@ -421,7 +422,7 @@ def test_extremes_are_finite(variant, name):
 
 @pytest.mark.parametrize(("name", "threshold", "epsilon"), SUITE[1:])
 def test_clusters_are_used(variant, name, threshold, epsilon):
-    """Else the tests above would be tests of the exact mode, as that at 1e-4 is."""
+    """Otherwise the tests above would test the exact mode, as they do at 1e-4."""
     bsdf = load(LARGE_MAPS[name], threshold=threshold, epsilon=epsilon)
     kernel = bsdf.pndf.texel_kernel(bsdf.footprint(VIEW.interaction()))
     assert bsdf.pndf.rung(kernel)[0] > 0

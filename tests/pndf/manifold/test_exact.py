@@ -1,4 +1,4 @@
-"""The P-NDF of the manifold as such; what the BSDF makes of it is in test_glint_manifold.py."""
+"""The P-NDF of the manifold itself; test_glint_manifold.py tests the BSDF."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def noise(shape, wrap_mode="repeat", spread=0.05):
 
 
 def random_footprints(count, seed=2, largest=0.3):
-    """Rotated ones, from 0.002 maps on, at places up to three maps away."""
+    """Rotated footprints, from 0.002 maps on, at most three maps away."""
     rng = np.random.default_rng(seed)
     uv = rng.random((2, count)) * 6 - 3
     sigma = np.exp(rng.uniform(np.log(0.002), np.log(largest), (2, count)))
@@ -67,7 +67,8 @@ def test_lists_equal_the_loop_over_all_quads(variant, tune, shape, wrap_mode):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_both_ways_give_the_same_where_they_meet(variant, tune, kernel):
-    """Footprints around few_quads, every lane choosing for itself: as if all took one way."""
+    """For footprints around few_quads, where each lane chooses one of two sums, both sums are
+    equal."""
     normal_map = maps.isotropic(64, seed=1)
     pndf = Manifold(normal_map, kernel)
     sigma = mi.Float(np.linspace(0.3, 3, 4000).astype(np.float32) / 64)
@@ -137,7 +138,7 @@ def test_zero_outside_of_the_disk_and_of_the_map(variant):
 
 
 def test_density_of_a_constant_gradient(variant):
-    """n(u) = G u has the density k/|det G|: a Gaussian, known in closed form."""
+    """n(u) = G u has the density k/|det G|, which is a Gaussian in closed form."""
     size, slope = 256, 1e-3
     i, j = np.indices((size, size))
     normals = np.stack([slope * (j - size / 2), 2 * slope * (i - size / 2)], -1)
@@ -155,7 +156,8 @@ def test_density_of_a_constant_gradient(variant):
 
 
 def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
-    """Across a step all are; their determinants, 0, are rounded to more than this epsilon."""
+    """Across a step all triangles are degenerate; rounding makes their determinants, which are 0,
+    larger than this epsilon."""
     normals = np.zeros((32, 32, 2), np.float32)
     normals[:, :16], normals[:, 16:] = (-0.3, 0), (0.6, 0.1)
     pndf, middle, count = Manifold(NormalMap(normals), epsilon=1e-9), (0.15, 0.05), 100_000
@@ -170,7 +172,7 @@ def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
 
 
 def test_memory(variant):
-    """64 MB are allowed for the structure of 1024², besides the map itself."""
+    """The structure of 1024² may take 64 MB, besides the map itself."""
     parts = Manifold(maps.isotropic(1024, seed=1)).parts()
     assert parts["map"] >= 2 * 4 * 1024**2
     assert parts["vertices"] + parts["lists of quads"] <= 64e6
@@ -226,7 +228,7 @@ def test_epsilon_must_be_a_small_positive_number(variant, epsilon):
 
 
 def test_lists_hold_no_more_than_memory_allows_for_white_noise(variant):
-    """Triangles that span the whole range of normals reach into every cell."""
+    """The triangles span the whole range of normals, and reach into every cell."""
     pndf = Manifold(noise((128, 128), spread=0.3 / 3))
     assert pndf.nbytes <= 61 * 128**2
 
@@ -238,7 +240,7 @@ def test_lists_hold_no_more_than_memory_allows_for_white_noise(variant):
     lambda normal_map: Manifold(normal_map, kernel="disk"),
 ], ids=["exact", "tables", "clusters", "disk"])  # fmt: skip
 def test_derivative_of_a_leaning_map(variant, make):
-    """Where all normals lean by s, D moves as a whole, D(m; s) = D(m − s; 0): F = ∫ D L dm has the
+    """If all normals lean by s, D moves as a whole, D(m; s) = D(m − s; 0). So F = ∫ D L dm has the
     derivative ∫ D ∂L/∂m, whatever D is."""
     normal_map = maps.isotropic(64, alpha=0.15, correlation_length=6, seed=2)
     n, width = 500, 0.9

@@ -1,4 +1,5 @@
-"""Projected areas: one triangle against the paper's closed form in float64, and footprints."""
+"""Projected areas: one triangle against the paper's closed form in float64, and whole
+footprints."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ def arc(p: float) -> float:
 
 
 def line_integral(a: np.ndarray, b: np.ndarray, w_x: float, w_z: float) -> float:
-    """Eq. 12 for a straight piece of the boundary."""
+    """Eq. 12 for a straight part of the boundary."""
     length = np.hypot(*(b - a))
     if length == 0:
         return 0.0
@@ -90,14 +91,14 @@ def random_disk(rng, count: int, radius=1.0) -> np.ndarray:
 
 
 def random_directions(rng, count: int) -> np.ndarray:
-    """Half of them uniform on the hemisphere, half grazing, down to ω_z = 1e-6."""
+    """Directions, half of them uniform on the hemisphere, half grazing, down to ω_z = 1e-6."""
     z = np.where(rng.random(count) < 0.5, rng.random(count), 10 ** rng.uniform(-6, 0, count))
     phi, r = 2 * np.pi * rng.random(count), np.sqrt(1 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
 def random_triangles(kind: str, rng, count: int) -> np.ndarray:
-    """(count, 3, 2): anywhere in the disk; of a given size; or as thin as given."""
+    """Triangles (count, 3, 2): anywhere in the disk, of a given size, or of a given thinness."""
     name, _, size = kind.partition(" ")
     if name == "anywhere":
         return np.stack([random_disk(rng, count, 0.999) for _ in range(3)], 1)
@@ -111,7 +112,7 @@ def random_triangles(kind: str, rng, count: int) -> np.ndarray:
 
 
 def as_corners(triangles: np.ndarray, w: np.ndarray) -> tuple[Corners, np.ndarray]:
-    """Float32 corners, and the triangles in float64 as float32 sees them."""
+    """Corners in float32, and the same triangles in float64."""
     a, b, c = (mi.Vector2f(np.ascontiguousarray(triangles[:, i].T, np.float32)) for i in range(3))
     corners = Corners(a, b - a, c - a, mi.Vector3f(np.ascontiguousarray(w.T, np.float32)))
     first, e1, e2 = (np.array(v, np.float64).T for v in (a, b - a, c - a))
@@ -257,7 +258,8 @@ def test_box_over_whole_quads_is_exact(variant, alpha):
 
 
 def monte_carlo(mesh: TexelMesh, footprint: Footprint, w: np.ndarray, side: int = 700) -> float:
-    """Mean over jittered points of the kernel: error about 1/side² of a smooth integrand."""
+    """Mean over jittered points of the kernel; the error is about 1/side² for a smooth
+    integrand."""
     jitter = np.random.default_rng(9).random((2, side, side))
     u = np.float32((jitter + np.mgrid[:side, :side]) / side).reshape(2, -1)
     kernel = mesh.texel_kernel(footprint)
@@ -432,7 +434,7 @@ def test_furnace(variant, name):
 
 
 def together(views: list[View], lanes: int) -> mi.SurfaceInteraction3f:
-    """Interactions of several views, ``lanes`` of each, one after the other."""
+    """Interactions for several views, one after the other, with ``lanes`` of each."""
     si = views[0].interaction(lanes * len(views))
 
     def spread(vectors):

@@ -1,4 +1,4 @@
-"""The tables behind ``max_error``: their parts, their mass, their sampler, their error."""
+"""The tables for ``max_error``: their parts, their mass, their sampler, their error."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def pndf(variant, normal_map):
 
 
 def footprint(sigma=14.0, aspect=1.5, turn=0.6, uv=(0.3, 0.8), size=(128, 96)):
-    """Standard deviations in texels."""
+    """A footprint with these standard deviations in texels."""
     axes = (
         aspect * sigma * np.array([np.cos(turn), np.sin(turn)]),
         sigma * np.array([-np.sin(turn), np.cos(turn)]),
@@ -60,7 +60,8 @@ def density_of_bins(pndf, footprint):
 
 
 def test_clipped_areas_tile_the_triangle(variant):
-    """Over a grid that holds it they add up to its area, for random, thin and upright ones."""
+    """Over a grid that contains the triangle, they add up to its area, for random, thin and upright
+    triangles."""
     rng = np.random.default_rng(1)
     n = 3000
     corners = rng.uniform(1, 9, (3, 2, n))
@@ -79,7 +80,8 @@ def test_clipped_areas_tile_the_triangle(variant):
 
 
 def test_splines():
-    """Their integral is that of the piecewise polynomial; it grows from 0 to 1 about ½."""
+    """Their integral is that of the piecewise polynomial, and grows from 0 to 1, symmetrically
+    about ½."""
     t = np.linspace(-2, 2, 4001)
     a = np.abs(t)
     spline = np.where(a < 0.5, 0.75 - t * t, np.where(a < 1.5, 0.5 * (1.5 - a) ** 2, 0))
@@ -90,7 +92,7 @@ def test_splines():
 
 @pytest.mark.parametrize("period, count", [(96, 12), (100, 9), (37, 5), (40, 3), (8, 2), (9, 1)])
 def test_shares_are_those_of_sums_of_uniform_numbers(period, count):
-    """They add up to one everywhere, and are what the sampler's three numbers give."""
+    """They add up to one everywhere, and agree with the sampler's sum of three numbers."""
     of_node = spline_weights(period, count).toarray()
     assert np.allclose(of_node.sum(0), 1, atol=2e-7)
     u = np.random.default_rng(1).random((3, 200_000))
@@ -118,7 +120,8 @@ def test_coarse_splines_are_sums_of_fine_ones(period, count):
 
 @pytest.mark.parametrize("finest", [6, 12, 42])
 def test_mixtures_of_splines(finest):
-    """Those of two thirds of the nodes add up to one, and have the mean and variance stated."""
+    """The functions of two thirds of the nodes add up to one, and have the stated mean and
+    variance."""
     period, count = 40 * finest, 2 * finest // 3
     functions = np.array([function_of_node(period, finest, count, k) for k in range(count)])
     assert np.allclose(functions.sum(0), 1, atol=1e-6)
@@ -158,7 +161,7 @@ def test_packed_words_name_the_entries():
 
 @pytest.mark.parametrize("count", [(12, 18), (24, 6), (1, 5)])
 def test_levels_are_made_of_finer_ones(count):
-    """Step by step, the functions of all levels are those that stand for their nodes."""
+    """Step by step, the sums give the functions of the nodes of all levels."""
     counts = level_counts(count)
     periods = [8 * n for n in count]
     of_axes = [
@@ -173,7 +176,7 @@ def test_levels_are_made_of_finer_ones(count):
 
 
 def test_normals_of_quads_over_bins(variant):
-    """Every quad's mass is one, and has the mean of its triangles to within a bin."""
+    """The mass of every quad is one, and its mean is that of its triangles, within a bin."""
     normal_map = maps.leather(64, seed=1)
     mesh = Manifold(normal_map, epsilon=EPSILON)
     row, column = (v.ravel() for v in np.indices((64, 64)))
@@ -201,7 +204,8 @@ def test_mass_is_one(variant, shape, wrap_mode):
 
 
 def test_flat_map(variant):
-    """Bins of one and the same mass, which one half float rounds the same way; no error else."""
+    """All bins have the same mass, which half floats round in the same way; there is no other
+    error."""
     pndf = TabulatedManifold(maps.flat((1, 1)), epsilon=EPSILON, max_error=1e-3)
     view = footprint(1, size=(1, 1))
     assert pndf.level(view).numpy().item() == 0
@@ -230,7 +234,7 @@ def test_samples_have_the_density_of_the_bins(variant, normal_map, kernel):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
-    """The figures behind the predicted error: where every texel has a bin of its own."""
+    """The figures of the predicted error, for a map in which every texel has its own bin."""
     offset = (np.arange(-480, 480) + 0.5) / 96  # standard deviations
     y, x = np.meshgrid(offset, offset, indexing="ij")
 
@@ -263,7 +267,7 @@ def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", ["isotropic", "brushed", "flakes", "leather"])
 def test_predicted_error(variant, name, kernel):
-    """It is not above the one allowed; the error that there is is below, by less than a half."""
+    """It is at most the allowed error; the measured error is smaller, by less than a half."""
     normal_map = getattr(maps, name)(256, seed=1)
     allowed = 0.05 if kernel == "gaussian" else 0.5
     pndf = TabulatedManifold(normal_map, kernel, EPSILON, max_error=allowed)
