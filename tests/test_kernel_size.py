@@ -46,9 +46,9 @@ def interaction(partials: bool = True) -> mi.SurfaceInteraction3f:
     si.wi = dr.normalize(mi.Vector3f(0.2, 0.1, 1))
     si.duv_dx, si.duv_dy = mi.Vector2f(0.01, 0), mi.Vector2f(0, 0.01)
     dr.make_opaque(si)
-    # Nobody carries a turn of the half vector or a light's extent in these.
+    # These integrators pass neither a turn of the half vector nor a light's spread.
     si.dn_du, si.dn_dv = mi.Vector3f(0), mi.Vector3f(0)
-    if not partials:  # as of the integrators of Mitsuba
+    if not partials:  # as in Mitsuba's integrators
         si.duv_dx, si.duv_dy = mi.Vector2f(0), mi.Vector2f(0)
     return si
 
@@ -79,7 +79,7 @@ def sampling(bsdf: mi.BSDF) -> int:
     )
 
 
-#: Plugin, what all features off leaves, features off as one may write it, and each feature on.
+#: Plugin, minimal parameters, parameters that switch features off explicitly, and each feature on.
 FEATURES = [
     (
         "glint_manifold",
@@ -171,8 +171,8 @@ def test_filters_look_up_the_moments_they_need_only():
         method: operations(lambda method=method: Filtered(MAP, method).pyramid.average(footprint))
         for method in ("toksvig", "clean", "variance", "lean")
     }
-    # Three moments or four fit into one record of the MIP chain, LEAN's five do not. What lies
-    # between lookups variance mapping does not count.
+    # Three or four moments fit into one record of the MIP chain, LEAN's five do not. Variance
+    # mapping does not use the variance between lookups.
     assert counts["variance"] < counts["clean"] < counts["toksvig"] < counts["lean"]
 
 

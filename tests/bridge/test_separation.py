@@ -73,7 +73,8 @@ def assert_same(ours: dict, theirs: dict) -> None:
     for a, b in zip(
         everything(ours, smooth_context()), everything(theirs, mi.BSDFContext()), strict=True
     ):
-        # Measured: 3e-3, from the rational function that Mitsuba takes for Beckmann's masking.
+        # Measured: 3e-3, from the rational function by which Mitsuba approximates Beckmann's
+        # masking.
         assert np.allclose(a, b, rtol=5e-3, atol=1e-5)
 
 
@@ -183,7 +184,7 @@ def test_other_bsdfs_ignore_the_wish(variant, bsdf):
 def test_context(variant):
     assert asks_for_smooth_lobes(smooth_context())
     assert not asks_for_smooth_lobes(mi.BSDFContext())
-    # The bit is free in this version of Mitsuba, or the mechanism must find another.
+    # The bit must be unused in this version of Mitsuba; otherwise another one has to be chosen.
     flags = [int(flag) for flag in mi.BSDFFlags]
     assert not any(flag & SMOOTH_LOBES for flag in flags)
 
@@ -266,7 +267,7 @@ def test_parts_add_up(variant):
 
 def test_parts_add_up_in_each_variant(each_variant):
     whole, direct, indirect = parts(room(manifold()))
-    # A monochromatic image has one channel, which is each of those of the parts.
+    # A monochromatic image has one channel, which equals every channel of the parts.
     assert np.allclose(direct + indirect, whole, rtol=1e-4, atol=1e-5)
 
 
@@ -274,7 +275,7 @@ def test_direct_light_is_that_of_paths_of_two_segments(variant):
     """All direct light has glints; with the same random numbers, it is equal sample by sample."""
     scene = room(manifold())
     _, direct, _ = parts(scene, max_depth=8)
-    # Measured: 1e-6; other kernels round otherwise.
+    # Measured: 1e-6; other kernels round differently.
     assert np.allclose(direct, render(scene, max_depth=2), rtol=1e-4, atol=1e-5)
 
 
@@ -284,7 +285,7 @@ def test_indirect_light_is_that_of_the_smooth_metal(variant):
     alike = {"spp": 64, "pixel_share": 0.5, "emitters": "one"}
     _, _, indirect = parts(room(manifold()), **alike)
     _, _, expected = parts(room(rough()), **alike)
-    # The two round differently, which sends a few paths elsewhere. Measured: 3e-4.
+    # The two round differently, which changes a few paths. Measured: 3e-4.
     assert np.abs(indirect - expected).mean() < 2e-3 * expected.mean()
 
 

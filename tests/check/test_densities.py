@@ -11,8 +11,8 @@ from glintbsdf.check import densities, suite
 
 
 def test_quadrature_finds_spikes_of_any_size(variant):
-    # Half of the mass in three disks of radius 1e-4, half over the square: as narrow and as far
-    # apart as the highlights of flat triangles.
+    # Half of the mass in three disks of radius 1e-4, half over the square: the disks are as narrow
+    # and as far apart as the highlights of flat triangles.
     rng = np.random.default_rng(1)
     centres, radius = np.array([[0.3, -0.2], [0.31, -0.2], [-0.7, 0.9]]), 1e-4
 
@@ -35,7 +35,7 @@ def test_quadrature_finds_spikes_of_any_size(variant):
     assert total < 4e-3 and abs(mass.sum() - 1) < 4 * total
     counts = densities.count_in(cells, test)
     assert suite.p_value(counts, len(test), mass, error) > 1e-3
-    # A sampler that draws the spikes one percent wider is found out.
+    # The test detects a sampler that draws spikes that are one percent too wide.
     wider = test.copy()
     for centre in centres:
         near = np.linalg.norm(wider - centre, axis=1) < 2 * radius
@@ -44,7 +44,7 @@ def test_quadrature_finds_spikes_of_any_size(variant):
 
 
 def test_quadrature_is_led_to_needles_by_few_samples(variant, monkeypatch):
-    # As of 16 degenerate triangles: a thousandth of the mass each, in a quarter of the square.
+    # Like 16 degenerate triangles: each has a thousandth of the mass, in a quarter of the square.
     rng = np.random.default_rng(2)
     centres, radius = rng.uniform(0.1, 0.9, (16, 2)), 1e-5
 
@@ -56,10 +56,10 @@ def test_quadrature_is_led_to_needles_by_few_samples(variant, monkeypatch):
     r, angle = radius * np.sqrt(rng.random(320)), rng.uniform(0, 2 * np.pi, 320)
     offset = np.stack([r * np.cos(angle), r * np.sin(angle)], 1)
     points[:320] = centres[rng.integers(0, 16, 320)] + offset
-    monkeypatch.setattr(densities, "MOST_BOXES", 4)  # cut nowhere but where samples say so
+    monkeypatch.setattr(densities, "MOST_BOXES", 4)  # subdivide only where there are samples
     cells = np.array([[[-1, -1], [0, 1]], [[0, -1], [1, 1]]], float)
     mass, error = densities.mass_of(density, cells, points, (points[:, 0] >= 0).astype(int))
-    # Where none is led to, both mass and error are 0.
+    # Where no sample leads the subdivision, both mass and error are 0.
     assert error[1] < 0.02 and (np.abs(mass - [0.984, 0.016]) < 4 * error + 1e-4).all()
 
 
@@ -70,7 +70,7 @@ def test_view_that_sees_no_facet(variant):
     assert (np.array(suite.sample(bsdf, view, 100)[1].pdf) == 0).all()
     found = densities.density(bsdf, view, 100)
     assert found == {"mass": 0.0, "mass_error": 0.0, "p_value": 1.0}
-    # A density that no sample has is found out.
+    # The test detects density without samples.
     stated = densities.density(Stated(bsdf, lambda *x: mi.Float(0.1)), view, 100)
     assert stated["mass"] > 0.05
 
@@ -86,7 +86,7 @@ class Stated:
 
 
 def test_cells_around_points_that_coincide(variant):
-    # As of a lobe that is hardly wider than the spacing of float32.
+    # Like a lobe that is hardly wider than the spacing of float32.
     points = np.full((300, 2), 0.6)
     points[200:] += np.linspace(0, 1e-4, 100)[:, None]
     cells, cell_of = densities.partition(points)

@@ -32,7 +32,7 @@ def truth():
 
 
 def test_surface():
-    # Heights and normals are those of one surface, which has the slopes that it was asked for.
+    # Heights and normals belong to the same surface, and its slopes have the requested variance.
     surface = Surface(64, slope=0.3, length=8, seed=1)
     n = surface.normal_map().normals.astype(np.float64)
     slopes = n / np.sqrt(1 - (n**2).sum(axis=2, keepdims=True))
@@ -44,8 +44,8 @@ def test_surface():
 
 
 def test_ray_tracing(variant, truth):
-    # At normal incidence everything leaves; at grazing angles most of what facets send downwards
-    # is lost. Measured by others for these slopes: 1.000, 0.993, 0.931, 0.935.
+    # At normal incidence all light leaves; at grazing angles most of the light that facets send
+    # down is lost. Measured by others for these slopes: 1.000, 0.993, 0.931, 0.935.
     assert truth[0.0] == pytest.approx(1, abs=2e-3)
     assert truth[69.0] == pytest.approx(0.931, abs=0.01)
     assert truth[83.0] == pytest.approx(0.935, abs=0.01)
@@ -63,7 +63,7 @@ def test_energy(variant, truth, name):
         for angle in ANGLES:
             energy, error = energies(bsdf, 64, sigma, angle, places=100, samples=200)
             assert (energy - 3 * error).max() <= 1.02, (sigma, angle)
-            # The places that are seen are a few of all: their mean has an error of its own.
+            # Only a few places are evaluated, so their mean has a statistical error.
             noise = 3 * energy.std() / 10
             if angle < 80:
                 assert abs(energy.mean() - truth[angle]) <= 0.02 + noise, (sigma, angle)

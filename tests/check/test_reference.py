@@ -106,7 +106,7 @@ def test_box_footprint_fills_a_rectangle():
     x, y = np.meshgrid(position * 4e-3, position * -6e-3)
     normal_map = NormalMap(np.stack((x, y), axis=2), "clamp")
     # Standard deviations (4, 2) texels: normals up to 1.5 x 4 x 4e-3 and 1.5 x 2 x 6e-3. A box
-    # takes the covariance's diagonal only.
+    # uses only the covariance's diagonal.
     covariance = texel_covariance(normal_map, (4.0, 2.0)) + np.array([[0, 1], [1, 0]]) * 1e-4
     corner = np.array([0.024, 0.018])
     found, error = binned_pndf(

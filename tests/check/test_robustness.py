@@ -32,7 +32,7 @@ def test_extremes_are_counted(variant):
     length = np.array(dr.norm(si.duv_dx))
     assert found == {"nan": int((length == 0).sum()), "negative": int((length > 50).sum())}
     assert found["nan"] > 100 and found["negative"] > 50
-    # Every extreme takes part.
+    # Every extreme occurs.
     assert np.array(si.wi.z).min() == 0 and np.abs(np.array(si.uv)).max() > 1e5
 
 
@@ -48,7 +48,7 @@ def test_float64_sees_a_difference_and_leaves_nothing_behind(variant):
     bsdf = load()
     good = robustness.double_error(bsdf, load, 500)
     assert 0 < good["error"] < 1e-3
-    # In place of the same surface in float64, one whose highlights are a little wider.
+    # Instead of the same surface in float64, a surface with slightly wider highlights.
     bad = robustness.double_error(bsdf, lambda: load(1.1e-6), 500)
     assert bad["error"] > 0.03
     assert type(load().pndf.vertices) is mi.Float and mi.Float is not mi.Float64

@@ -53,7 +53,7 @@ def scene(material: dict) -> mi.Scene:
 def test_manifold_agrees_with_the_truth(variant):
     normal_map = maps.isotropic(32, seed=3)
     expected = truth.reference_render(scene(truth.mirrors(normal_map, 5)), spp=2048, passes=8)
-    # Footprints of a hundredth of a texel: at 512 samples per pixel as good as points.
+    # Footprints of a hundredth of a texel, at 512 samples per pixel, are nearly points.
     glints = {
         "type": "glint_manifold",
         "data": mi.TensorXf(normal_map.normals),

@@ -64,7 +64,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(capsys, monkeypatch, variant):
     """Run the command line; return its exit status, its output and its errors."""
 
-    # A busy machine would have lines of progress among the errors.
+    # On a busy machine, progress lines would appear among the errors.
     monkeypatch.setattr("glintbsdf.core.progress._FIRST_LINE", 1e6)
 
     def run(*arguments: str | Path) -> tuple[int, str, str]:
@@ -75,7 +75,7 @@ def run(capsys, monkeypatch, variant):
             cli.main()
         captured = capsys.readouterr()
         code = exit.value.code
-        if isinstance(code, str):  # what Python does with sys.exit("message")
+        if isinstance(code, str):  # like Python for sys.exit("message")
             return 1, captured.out, captured.err + code + "\n"
         return code, captured.out, captured.err
 
@@ -301,11 +301,11 @@ def test_interruption_leaves_nothing_half_done(folder, variant):
         deadline = time.monotonic() + 60
         while set(folder.iterdir()) == before and time.monotonic() < deadline:
             time.sleep(0.05)
-        time.sleep(0.5)  # into loading or rendering
+        time.sleep(0.5)  # while it loads or renders
         os.kill(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=120)
     finally:
-        process.kill()  # one that does not end would slow all that follows
+        process.kill()  # a process that does not end would slow all later tests
     assert process.returncode == 1
     left = set(folder.iterdir()) - before
     if left:

@@ -112,7 +112,7 @@ def test_until_error(run, folder):
     result = run("--until-error", 0.05)
     share, noise = result.stderr.split(" % of the samples, noise ")
     assert float(share) < 100 and float(noise) <= 0.05
-    # The noise that was promised, against an image of more samples.
+    # The requested noise, against an image with more samples.
     difference = np.sqrt(np.mean((pixels() - complete) ** 2)) / complete.mean()
     assert 0.3 * float(noise) < difference < 1.5 * float(noise)
 
@@ -177,7 +177,7 @@ def test_ctrl_c_ends_workers_as_well(folder, variant):
     assert errors.startswith("Error: interrupted: scene.exr has "), errors
     assert np.isfinite(pixels()).all()
     deadline = time.monotonic() + 60
-    with pytest.raises(ProcessLookupError):  # nobody of them is left
+    with pytest.raises(ProcessLookupError):  # no process is left
         while time.monotonic() < deadline:
             os.killpg(process.pid, 0)
             time.sleep(0.5)

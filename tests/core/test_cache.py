@@ -58,7 +58,7 @@ def forbidden():
     raise AssertionError("built although it is in the cache")
 
 
-# Its arrays are those of Builder, as far as the cache can tell.
+# For the cache, its arrays are the same as those of Builder.
 forbidden.__qualname__ = Builder.__qualname__
 
 

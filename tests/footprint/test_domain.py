@@ -69,7 +69,7 @@ def test_recorder_finds_what_footprints_touch(variant):
     first = np.floor((uv * size - 0.5 - extent).min(axis=1))
     last = np.floor((uv * size - 0.5 + extent).max(axis=1)) + 1
     assert domain.columns == (first[0], last[0]) and domain.rows == (first[1], last[1])
-    # Random axes come near to both ends; sizes are known to a 16th of an octave.
+    # Random axes come close to both ends; sizes are known to a 16th of an octave.
     assert 2 * 2 ** (-1 / 16) * 0.99 < domain.smallest <= 2.01
     assert 7.7 < domain.largest < 8 * 2 ** (1 / 16)
 
@@ -111,7 +111,7 @@ def test_lists_of_a_part_of_the_map(variant, wrap_mode, centre):
         trimmed = Manifold(whole_map, domain=domain)
         assert np.array_equal(trimmed.eval(m, footprint).numpy(), expected)
         assert trimmed.nbytes < complete.nbytes
-    # Far outside of a clamped map there is one normal, which no other equals.
+    # Far outside a clamped map there is a single normal, different from all others.
     assert (expected > 0).any() or wrap_mode == "clamp"
 
 
@@ -260,7 +260,7 @@ def test_waiting_to_be_built(variant, plugin):
     si.wi = dr.normalize(mi.Vector3f(0.2, 0.1, 1))
     wo = dr.normalize(mi.Vector3f(-0.2, 0, 1))
 
-    # What stands in for it is a smooth surface; nothing of the map's structures is there.
+    # The replacement is a smooth surface, without structures of the map.
     smooth, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo)
     assert (
         np.ptp(np.array(smooth[0])) == 0 and np.array(smooth[0])[0] > 0 and (pdf > 0).numpy().all()

@@ -15,7 +15,7 @@ from glintbsdf.footprint.kernels import KERNELS, SIGMA_MIN, TexelKernel, limit_e
 
 WIDTH, HEIGHT = 128, 64
 
-# Axes in texels: round, stretched and rotated, and a line, which SIGMA_MIN alone gives a width.
+# Axes in texels: round, stretched and rotated, and a line, whose width is SIGMA_MIN.
 FOOTPRINTS = {
     "round": ((2, 0), (0, 2)),
     "rotated": ((6, 3), (-0.5, 1)),
@@ -45,7 +45,7 @@ def test_samples_have_the_covariance_and_stay_inside(variant, kernel, axes):
     k = texel_kernel(kernel, axes)
     offset = samples(k)
     sigma = covariance(axes)
-    # Variance per axis of the whitened kernel; the box knows the axes of the map alone.
+    # Variance per axis of the whitened kernel; the box uses only the map's axes.
     scale = {
         "gaussian": 1 - 4.5 * np.exp(-4.5) / (1 - np.exp(-4.5)),
         "disk": 2.25 / 4,
@@ -111,7 +111,7 @@ def test_limit_extent_keeps_the_width_of_a_long_footprint(variant):
 
 @pytest.mark.parametrize("length", [1e3, 1e8, 1e15])
 def test_limit_extent_of_parallel_axes(variant, length):
-    # What a cone of rays at a grazing angle makes: the narrow axis is lost in rounding, and the
+    # The footprint of a ray cone at a grazing angle: the narrow axis is lost in rounding, and the
     # footprint must not grow with the noise.
     along = mi.Vector2f(cos(2.4), sin(2.4)) * length
     for du, dv in ((along, -0.876 * along), (0.3 * along, along), (along, mi.Vector2f(0))):

@@ -41,7 +41,8 @@ def test_floats_are_read_as_they_look(told, channels, dtype, tolerance):
         data = numbers[..., :channels].astype(dtype)
         for given in ("auto", encoding):
             np.testing.assert_allclose(read(data, encoding=given), NORMALS, atol=tolerance)
-        # What a type alone would not tell is said once, with the remedy; what was stated is not.
+        # Guesses that the type alone does not settle give one message with a remedy; stated types
+        # give none.
         warnings = told()
         assert len(warnings) == (encoding == "unsigned")
         assert all('(encoding unsigned); "encoding" signed' in text for text in warnings)
@@ -69,7 +70,7 @@ def test_integers_of_every_kind():
     np.testing.assert_allclose(read(BYTES[..., :2]), NORMALS, atol=2 / 255)
     signed = np.round(32767 * VECTORS).astype(np.int16)
     np.testing.assert_allclose(read(signed), NORMALS, atol=1e-4)
-    # Unsigned components that were stored as they are: the map says so, not its type.
+    # Unsigned components that were stored unchanged: the data show it, not the type.
     leaning = np.broadcast_to((0.3, 0.2, np.sqrt(0.87)), (8, 8, 3))
     plain = np.round(65535 * leaning).astype(np.uint16)
     np.testing.assert_allclose(read(plain), leaning[..., :2], atol=1e-4)
@@ -122,7 +123,7 @@ def test_curl_tells_which_way_green_points(told):
     assert '"flip_y" true' in text and "OpenGL against DirectX" in text
     for stated in (False, True):
         read(flipped, flip_y=stated)
-    # Nothing speaks for either in a map that is flat, or curved across one axis only.
+    # There is no evidence for either in a map that is flat, or curved across one axis only.
     read(maps.flat(SIZE).normals)
     read(np.broadcast_to(BYTES[:1], BYTES.shape))
     assert not told()
@@ -180,7 +181,7 @@ def test_alpha_may_carry_x(told):
             np.testing.assert_array_equal(read(data, map_type=map_type), expected)
             assert any("taken from the alpha channel" in text for text in told())
     assert NormalMap.from_array(np.dstack((y, y, y, x)), "height").is_height
-    # An alpha that masks, whole or in part, is no x.
+    # An alpha channel that masks texels, fully or partly, is not an x component.
     for alpha in (full, full * DISK, np.round(255 * gaussian_filter(1.0 * DISK, 1)).astype("u1")):
         assert NormalMap.from_array(np.dstack((GREY, GREY, GREY, alpha))).is_height
         np.testing.assert_array_equal(read(np.dstack((BYTES, alpha))), read(BYTES))
@@ -201,7 +202,7 @@ def test_voids_of_heights(told):
             read(data)
         filled = read(data, fill_voids=True)
         assert any("7 of 2304 texels (0.3 %) hold nothing" in text for text in told())
-        # Away from the voids nothing has changed; beside them the slope is that of one side.
+        # Away from the voids nothing changes; beside them the slope is a one-sided difference.
         away = np.ones(height.shape, bool)
         for row, column in ((10, 10), *np.ndindex(3, 2)):
             r, c = (row, column) if row == 10 else (row + 20, column + 20)
@@ -221,7 +222,7 @@ def test_padding_of_an_atlas(told):
         filled = read(data, fill_voids=True)
         assert any("hold nothing" in text for text in told())
         np.testing.assert_array_equal(filled[DISK], read(BYTES)[DISK])
-        # Each takes the normal of a texel that has one.
+        # Each gets the normal of a texel that has one.
         inside = {tuple(normal) for normal in read(BYTES)[DISK]}
         assert {tuple(normal) for normal in filled[~DISK]} <= inside
     transparent = np.dstack((BYTES, np.where(DISK, 255, 0).astype(np.uint8)))

@@ -113,7 +113,7 @@ def test_unsigned_integers_are_fractions(dtype):
     step = 2 / np.iinfo(dtype).max
     normals = random_normals()
     decoded = NormalMap.from_array(encode(normals, dtype)).normals
-    # Half a step of rounding per component, and what normalising it does: less than two steps.
+    # Half a step of rounding per component, and the effect of normalisation: less than two steps.
     np.testing.assert_allclose(decoded, normals[..., :2], atol=max(2 * step, 1e-7))
     height = random_heights()
     stored = np.round(height * np.iinfo(dtype).max).astype(dtype)
@@ -280,7 +280,7 @@ def test_readers_are_imported_when_needed_only():
 
 
 # -------------------------------------------------------------------------------------------------
-# What is refused
+# Invalid input
 # -------------------------------------------------------------------------------------------------
 
 

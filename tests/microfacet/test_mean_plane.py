@@ -66,7 +66,7 @@ def test_no_more_is_reflected_than_is_received(variant, correlated):
 def test_a_leaning_mirror_hides_nothing_of_itself(variant):
     slopes = np.array([[0.3], [-0.1]])
     for w, energy in (((0, 0, 1), 1), ((0.8, 0, 0.6), 1), ((-0.9, 0, np.sqrt(0.19)), 0)):
-        # From the last direction it is seen, and what it reflects goes below the horizon.
+        # The last direction sees it, but its reflection goes below the horizon.
         assert reflected(slopes, np.array(w, np.float64), True) == pytest.approx(energy, abs=1e-6)
 
 
@@ -88,7 +88,7 @@ def test_it_is_smooth_where_the_plane_turns_away(variant, correlated):
     plane_i = mi.Float([1e-3, 1e-6, 1e-20, 0])
     v = np.array(visibility(p_i, plane_i, p_o, plane_o, correlated))
     assert np.allclose(v, v[-1], rtol=0.03) and np.isfinite(v).all() and v[-1] > 0
-    # Nothing reaches it from behind, nor is anything seen of what does not face the viewer.
+    # Light from behind does not reach it, and facets that face away are not visible.
     plane_o = mi.Float([1e-2, 1e-4, 1e-6, 0])
     v = np.array(visibility(p_i, mi.Float(0.05), p_o, plane_o, correlated))
     assert (np.diff(v) < 0).all() and v[-1] == 0
@@ -116,14 +116,14 @@ def test_area_of_moments(variant):
         area = np.array(area_of_moments(mi.Float(mean * sigma), mi.Float(sigma**2))) / sigma
         for name, x in shapes.items():
             exact = np.maximum(mean[:, None] + x, 0).mean(axis=1)
-            # Never below, but for 0.3 % of the even one's rim; above by 9 % at most in front.
+            # Not below, except by 0.3 % at the rim of the even one; at most 9 % above in front.
             assert (area >= exact * (1 - 3e-3) - 1e-6).all(), name
             assert (area <= 1.09 * exact + 1e-6)[mean > 0].all(), name
         # Never above that of two facets, nor below the mean plane's own.
         two = 0.5 * (mean + np.sqrt(mean**2 + 1))
         assert (area <= two * (1 + 1e-3)).all()
         assert (area >= np.maximum(mean, 0) * (1 - 1e-6)).all()
-    # Continuous, with its slope, where the plane is seen edge on.
+    # Value and slope are continuous at the direction that sees the plane edge on.
     near = np.array(area_of_moments(mi.Float([-1e-3, 0, 1e-3]), mi.Float(1)))
     assert np.allclose(np.diff(near), 0.5e-3, rtol=2e-2)
     assert area_of_moments(mi.Float([-1, 0, 1]), mi.Float(0)).numpy() == pytest.approx(

@@ -21,7 +21,7 @@ LOBES = {
     "rotated": ((0.3, -0.5), (0.09, 0.04, -0.05)),
     "rough": ((-0.4, 0.2), (1.0, 0.25, 0.3)),
 }
-# From above, at an angle, grazing; from behind the mean facet of a lobe that leans away.
+# From above, oblique, grazing, and from behind the mean facet of a lobe that leans away.
 VIEWS = [(0, 0, 1), (0.6, -0.3, 1), (-1, 0.2, 0.2), (-1, 1.2, 0.05), (1, 0, 0.01)]
 
 
@@ -143,7 +143,7 @@ def test_visible_normals_are_distributed_as_their_density_says(variant, name, di
     for view in VIEWS:
         w = np.array(view) / np.linalg.norm(view)
         if lobe.visible_area(mi.Vector3f(w))[0] == 0:
-            continue  # turned away: what is sampled has a pdf of 0
+            continue  # turned away: samples have a pdf of 0
         m = lobe.sample_visible(dr.repeat(mi.Vector3f(w), count), u[0], mi.Point2f(u[1], u[2]))
         m = np.array(m, np.float64)
         assert np.isfinite(m).all() and np.allclose((m**2).sum(axis=0), 1, atol=1e-5)
@@ -161,7 +161,7 @@ def test_visible_normals_are_distributed_as_their_density_says(variant, name, di
         assert quadrature_error < 0.03
         expected = (features(x, y) * visible).sum(axis=(1, 2)) / visible.sum()
         error = sampled.std(axis=1) / np.sqrt(count)
-        # 15 features of 40 settings: 4.5 sigma; and as much for the quadrature as it errs on 1.
+        # 15 features of 40 settings: 4.5 sigma; for the quadrature, its own error of the total 1.
         assert (
             np.abs(sampled.mean(axis=1) - expected) < 4.5 * error + quadrature_error + 1e-6
         ).all(), view
@@ -197,7 +197,7 @@ def test_derivative_of_a_sample(variant):
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 @pytest.mark.parametrize("turned", [False, True])
 def test_thin_lobes_keep_their_digits(variant, distribution, turned):
-    # Two planes that meet under the footprint: all slopes on a line, and a roughness of 1e-4.
+    # Two planes meet under the footprint: all slopes are on a line, with a roughness of 1e-4.
     alpha, line = 1e-4, np.array([0.9, 0.1][:: -1 if turned else 1])
     uu, vv, uv = (*(alpha**2 + line**2), line[0] * line[1])
     determinant = alpha**2 * (alpha**2 + (line**2).sum())
@@ -209,7 +209,7 @@ def test_thin_lobes_keep_their_digits(variant, distribution, turned):
     x = along[..., None] * line + across[..., None] * alpha * normal
     s = np.float32(x / np.sqrt(1 + (x**2).sum(-1, keepdims=True)))
     value = np.array(lobe.eval(mi.Vector2f(*(mi.Float(c.ravel()) for c in np.moveaxis(s, -1, 0)))))
-    distance = along**2 + across**2  # but for terms of alpha²
+    distance = along**2 + across**2  # except for terms of alpha²
     shape = np.exp(-distance) if distribution == "beckmann" else 1 / (1 + distance) ** 2
     expected = shape * (1 + (x**2).sum(-1)) ** 2 / (np.pi * np.sqrt(determinant))
     # Normals and the direction of the line are rounded to 6e-8: 6e-4 of the width, twice.

@@ -12,8 +12,8 @@ from glintbsdf.microfacet.slope_frame import SlopeFrame
 WIDTH, HEIGHT = 40, 25
 RNG = np.random.default_rng(5)
 
-# ∂p/∂u and ∂p/∂v in world units, with parts along the shading normal as interpolated normals give
-# them; and to_uv.
+# ∂p/∂u and ∂p/∂v in world units, with components along the shading normal, as for interpolated
+# normals; and to_uv.
 SURFACES = {
     "square": ([2, 0, 0], [0, 2, 0], [[1, 0], [0, 1]]),
     "left-handed": ([2, 0, 0], [0, -2, 0], [[1, 0], [0, 1]]),

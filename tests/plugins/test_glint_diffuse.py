@@ -50,7 +50,7 @@ def hemisphere(count: int) -> mi.Vector3f:
 
 
 def test_value_is_the_projected_area(variant):
-    # Eq. 14: f_d cosθ = P(ω)/π, by points of the map under the footprint.
+    # Eq. 14: f_d cosθ = P(ω)/π, from random points of the map under the footprint.
     bsdf = load(MAPS["isotropic"], reflectance=0.8)
     wo = hemisphere(40)
     value = np.array(bsdf.eval(mi.BSDFContext(), RESOLVED.interaction(40), wo))[0]
@@ -68,8 +68,8 @@ def test_value_is_the_projected_area(variant):
 
 
 def test_a_plane_is_diffuse_about_its_normal(variant):
-    # One facet: its own area per area of the surface for "manifold"; "oren_nayar" is then Mitsuba's
-    # diffuse inside normalmap, whose normal counts with the surface's area.
+    # A single facet: "manifold" counts its area per area of the surface; "oren_nayar" equals
+    # Mitsuba's diffuse inside normalmap, whose normal counts with the surface's area.
     tilt, azimuth = 0.5, 0.3
     n = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     wo = hemisphere(200)
@@ -121,9 +121,9 @@ def test_oren_nayar(variant):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_furnace(variant, method):
-    # A facet counts with its own area, 1/m_z, and sees the part (1 + m_z)/2 of the upper
-    # hemisphere: the whole reflects the mean of (1 + 1/m_z)/2. Oren and Nayar's model loses what
-    # facets would reflect to each other.
+    # A facet has the area 1/m_z, and sees the fraction (1 + m_z)/2 of the upper
+    # hemisphere, so the whole reflects the mean of (1 + 1/m_z)/2. Oren and Nayar's model loses the
+    # light that facets reflect to each other.
     bsdf = load(MAPS["isotropic"], method=method, reflectance=1.0)
     view = View(du=(1, 0), dv=(0, 1))
     _, _, weight = suite.sample(bsdf, view, 20_000)
@@ -139,7 +139,8 @@ def test_furnace(variant, method):
 
 
 def test_importance_is_the_reverse(variant):
-    # f_d looks at the light alone: where importance is transported, that is the other direction.
+    # f_d depends on the light's direction only, which is the other one when importance is
+    # transported.
     bsdf = load(MAPS["isotropic"])
     si, wo = RESOLVED.interaction(50), hemisphere(50)
     importance = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), si, wo)
@@ -198,7 +199,7 @@ def test_albedo_and_description(variant):
 #  Parameters
 # --------------------------------------------------------------------------------------------------
 
-# Of the shared ones, those that a diffuse surface has as well.
+# The shared parameters that a diffuse surface has, too.
 SHARED = [
     (changes, name)
     for changes, name in suite.BAD_PARAMETERS

@@ -129,7 +129,7 @@ def test_a_leaning_map_reflects_no_more_than_arrives(variant):
         view = View(du=(0.1, 0), dv=(0, 0.1), wi=wi)
         suite.check_furnace(tilted, view)
         gained = max(gained, np.mean(suite.intensity(suite.sample(lean, view, 5000)[2])))
-    assert gained > 1.1  # over the geometric surface it does
+    assert gained > 1.1  # with respect to the geometric surface it does
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_derivatives(variant, method, key):
 
 
 # --------------------------------------------------------------------------------------------------
-#  What the filters are
+#  Values of the filters
 # --------------------------------------------------------------------------------------------------
 
 
@@ -208,7 +208,7 @@ def test_lean_is_the_convolved_distribution_of_a_gaussian_map(variant):
     alpha = 0.05
     footprint = Footprint.isotropic(mi.Point2f(0.4, 0.7), 128 / 512)
     pndf = Filtered(normal_map, "lean", alpha)
-    # Slopes of the map, each of which is a small lobe: their mean is the convolution.
+    # Every slope of the map is a small lobe; the mean of the lobes is the convolution.
     rng = np.random.default_rng(1)
     place = (0.4, 0.7) * np.array(512) - 0.5 + 128 * rng.standard_normal((60_000, 2))
     column, row = np.rint(place).astype(int).T % 512

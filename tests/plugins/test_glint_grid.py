@@ -28,7 +28,7 @@ SURFACES = {
     "varied": {"size_variation": 2.0},
     "equal": {"size_variation": 0.0},
 }
-# A rotated footprint of some microdetails, at a slant that reflects nothing below the horizon.
+# A rotated footprint with a few microdetails, whose reflections stay above the horizon.
 RESOLVED = View(du=(4e-4, 3e-4), dv=(-1.5e-4, 2e-4), wi=(0.3, 0.1, 1))
 
 
@@ -87,13 +87,13 @@ def test_count_has_mean_and_variance_of_the_binomial(variant, n, p):
     count, p = counts(n, p)
     mean, variance = n * p, n * p * (1 - p)
     assert count.min() >= 0 and count.max() <= n
-    # Measured: at most 8e-4 of the rarer outcome, where the Gaussian sets in. The strata see events
-    # down to a few times their number; beyond 2^24, float32 rounds what is counted.
+    # Measured: at most 8e-4 of the rarer outcome, where the Gaussian begins. The strata find events
+    # down to a few times their number; beyond 2^24, float32 rounds the counts.
     rarer = min(mean, n - mean)
     resolution = 4 * np.sqrt(variance) / len(count) + 4 / len(count) + n * 2.0**-24
     assert abs(count.mean() - mean) <= 1e-3 * rarer + resolution
     if rarer > 0.01 and n < 1e7:
-        # Measured: 1 % where the Gaussian sets in.
+        # Measured: 1 % where the Gaussian begins.
         assert np.isclose(count.var(), variance, rtol=0.015)
 
 
@@ -105,7 +105,7 @@ def test_small_counts_are_exactly_binomial(variant, n, p):
     values = values[values >= 0]
     frequency = [(count == k).mean() for k in values]
     expected = scipy.stats.binom.pmf(values, n, p)
-    # The tail takes over after ten terms. Each frequency is off by a stratum, plus the rounding of
+    # The tail begins after ten terms. Each frequency has an error of one stratum, plus rounding of
     # float32 in ten products.
     assert np.allclose(frequency, expected, rtol=1e-5, atol=4 / len(count))
 
@@ -198,7 +198,7 @@ def test_anisotropy_is_limited(variant):
 @pytest.mark.parametrize("name", SURFACES)
 def test_mean_is_the_smooth_surface(variant, name):
     count = 1 << 19
-    # On 2^9 times as large a square cells that two places share are rare, along grooves as well
+    # On a square 2^9 times as large, two places rarely share a cell, even along grooves
     si = scattered_interactions(count, extent=512, sigma=2e-3)
     bsdf = load(density=5.0, **SURFACES[name])
     values = relative_values(bsdf, beckmann(**SURFACES[name]), si)
@@ -211,7 +211,7 @@ def test_mean_is_the_smooth_surface(variant, name):
 def test_variance_falls_as_density_grows(variant):
     si = scattered_interactions(20_000, extent=1, sigma=1e-3)
     deviations = [relative_values(load(density=d), beckmann(), si).std() for d in (4, 6, 8, 10, 12)]
-    # Where pixels hold many microdetails, ten times as many make half a decade less noise.
+    # If pixels contain many microdetails, ten times as many reduce the noise by half a decade.
     assert (np.diff(deviations) < 0).all()
     assert np.allclose(np.array(deviations[2:-1]) / deviations[3:], 10, rtol=0.15)
 
@@ -225,7 +225,7 @@ def test_far_away_all_is_smooth(variant):
 
 
 def test_one_microdetail_is_resolved(variant):
-    # Vertices of the finest grid, where no other has a weight
+    # At vertices of the finest grid, no other grid point has a weight
     bsdf = load(density=2.0, size_variation=0.0)
     si = scattered_interactions(4000, extent=100, sigma=0.0)
     si.uv = 0.1 * dr.round(10 * si.uv)
@@ -354,7 +354,7 @@ def test_consistency(variant, name):
     bsdf = load(material="Al", **SURFACES[name])
     for view in (RESOLVED, replace(RESOLVED, wi=(-1, 1, 0.2)), EXTREME_VIEWS["1000:1"]):
         suite.check_eval_pdf(bsdf, view)
-        # Where the half vector recomputed from wo falls into another cell, so does the count.
+        # If the half vector recomputed from wo falls into another cell, the count changes.
         suite.check_weights(bsdf, view)
         suite.check_horizon(bsdf, view)
         suite.check_adjoint(bsdf, view)
@@ -375,7 +375,7 @@ def test_extreme_densities(variant, density):
 
 @pytest.mark.parametrize("name", ["isotropic", "grooves", "wheel"])
 def test_furnace_on_average(variant, name):
-    # One place may reflect more than it receives; all places together may not.
+    # A single place may reflect more than it receives; the average may not.
     count = 100_000
     bsdf = load(**SURFACES[name])
     for wi in ((0, 0, 1), (1, 0, 1), (1, 1, 0.1)):
@@ -534,7 +534,7 @@ def test_dense_is_roughconductor(variant, integrator):
     glints = describe(density=12.0, footprint_sigma=0.5, pixel_spread=3.6e-3, material="Cu")
     smooth = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.3, "material": "Cu"}
     glints, smooth = render(glints, integrator), render(smooth, integrator)
-    # The same random numbers draw the same samples: measured 3e-3, which is roughconductor's
+    # Equal random numbers give equal samples: measured 3e-3, which is roughconductor's
     # masking and the last microdetails' noise.
     assert np.abs(glints - smooth).max() < 0.02 * smooth.mean()
     assert np.isclose(glints.mean(), smooth.mean(), rtol=4e-3)

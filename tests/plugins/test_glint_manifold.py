@@ -31,10 +31,10 @@ STIFF_MAPS = {
 ALL_MAPS = MAPS | STIFF_MAPS
 
 # A rotated footprint of about one texel by half a texel, seen at an angle from which nothing is
-# reflected below the horizon. A map of one texel takes a footprint of its own size.
+# reflected below the horizon. For a map of one texel, the footprint has the map's size.
 RESOLVED = View(du=(0.04, 0.03), dv=(-0.015, 0.02), wi=(0.3, 0.1, 1))
 RESOLVED_ONE_TEXEL = replace(RESOLVED, du=(0.6, 0), dv=(0, 0.6))
-# Wide enough to resolve the highlight of a clamped triangle with the bins of the suite.
+# Large enough for the suite's bins to resolve the highlight of a clamped triangle.
 EPSILON = 1e-3
 DENSITY_TESTS = 2 * (len(KERNELS) * len(MAPS) + len(STIFF_MAPS))
 
@@ -139,9 +139,9 @@ def test_extremes_are_finite(variant, name):
 
 
 def test_furnace(variant):
-    # A footprint that holds the whole map sees the map's roughness, which masking is made for.
-    # Smaller ones see slopes that lean towards the light or away from it: at normal incidence that
-    # does not count.
+    # A footprint that covers the whole map has the map's roughness, for which masking is derived.
+    # Smaller ones have mean slopes towards the light or away from it, which at normal incidence
+    # does not matter.
     for name in ("isotropic", "brushed", "flat"):
         bsdf = load(ALL_MAPS[name], masking="beckmann")
         for wi in ((0, 0, 1), (1, 0, 1), (0, 1, 0.3), (1, 1, 0.1)):

@@ -348,8 +348,8 @@ def test_footprint_behind_a_bounce(variant, bounce):
     ray = sensor_rays(400)
     error = errors(partials(shapes, ray), traced_partials(shapes, ray))
     if bounce == "mesh":
-        # Exact on a facet (median 4e-4 measured), while neighbouring rays that meet another facet
-        # find another plane (4e-2 measured).
+        # It is exact on a facet (median 4e-4 measured), while neighbouring rays that hit another
+        # facet find another plane (4e-2 measured).
         assert np.median(error) < 2e-3 and error.max() < 0.1
     else:
         assert error.max() < 1e-3  # 3e-4 measured: float32 differences of neighbouring rays

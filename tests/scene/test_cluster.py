@@ -179,7 +179,7 @@ def test_files_are_sent_where_they_are_not(job, two):
 
 
 # ---------------------------------------------------------------------------------------------
-#  Ends, and going on
+#  Interruption and continuation
 # ---------------------------------------------------------------------------------------------
 
 
@@ -258,7 +258,7 @@ def test_sums_of_halves():
 
 
 # ---------------------------------------------------------------------------------------------
-#  What is refused
+#  Errors
 # ---------------------------------------------------------------------------------------------
 
 
@@ -332,7 +332,7 @@ def test_a_local_cluster_listens_on_loopback_only(two):
 
 
 # ---------------------------------------------------------------------------------------------
-#  A scheduler of its own
+#  A separate scheduler
 # ---------------------------------------------------------------------------------------------
 
 
@@ -362,7 +362,7 @@ class Scheduler:
             ),
             self.start(folder, worker_path, "worker", self.address, "--no-dashboard", *common),
         ]
-        # A user waits for the scheduler's address before he gives it to a command.
+        # Users wait for the scheduler's address before they pass it to a command.
         while not listens(int(port)):
             assert self.processes[0].poll() is None
             time.sleep(0.2)
@@ -450,7 +450,7 @@ def test_a_worker_without_the_package(job, tmp_path, elsewhere):
         worker_there(scheduler)
         with pytest.raises(ClusterError, match=r"the worker tcp://\S+ has no glintbsdf"):
             Cluster.at(scheduler.address, tell=print).__enter__()
-        late = Cluster(None, print)  # one that came when nobody asked any more
+        late = Cluster(None, print)  # an answer that arrives when nobody waits for it
         from distributed import Client
 
         with Client(scheduler.address) as late.client:

@@ -90,7 +90,7 @@ def test_survey_follows_whole_paths(folder):
     direct, indirect = (
         inspection.survey(load(integrator="glint_path", depth=depth))[0] for depth in (2, 6)
     )
-    # The sphere, which the sensor does not see, reflects most of the square.
+    # The sphere, which is outside the image, reflects most of the square.
     assert direct.columns[1] - direct.columns[0] < 20
     assert indirect.columns[1] - indirect.columns[0] > 60
     assert indirect.largest > 4 * direct.largest
@@ -123,7 +123,7 @@ def test_trimmed_rendering_is_the_same(folder, plugin, path):
     whole = sum(inspected.bsdfs[0].parts().values())
     if path[0] == "path":
         assert trimmed.sufficed
-        assert kept < whole or plugin == "glint_diffuse"  # whose vertices are all it has
+        assert kept < whole or plugin == "glint_diffuse"  # which has only its vertices
 
 
 @pytest.mark.parametrize("part", ["columns", "rows", "smallest", "largest"])

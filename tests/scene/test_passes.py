@@ -134,7 +134,7 @@ def test_tiles_make_the_whole(variant, rfilter, most, monkeypatch):
     assert len(tiles) > 3
     tiled = np.mean([np.array(rendering.render(loaded, 8, seed)) for seed in range(8, 16)], axis=0)
     assert np.isclose(tiled.mean(), whole.mean(), rtol=0.02)
-    # Nothing depends on chance in the sky, the filter's weights included.
+    # In the sky nothing is random, not even the filter's weights.
     sky = np.isclose(whole[..., 0], 0.3, rtol=1e-6)
     assert sky.mean() > 0.1
     assert np.isclose(tiled[sky], 0.3, rtol=1e-5).mean() > 0.98
@@ -149,7 +149,7 @@ def test_a_tile_reaches_as_far_as_the_filter(variant):
     border = sensor.film().rfilter().border_size()
     assert target == Tile(3 - border, 4 - border, 5 + 2 * border, 6 + 2 * border)
     assert sums.shape == (target.height, target.width, 4)
-    # Weights: all there is of the filter, of 2 samples in each of 30 pixels.
+    # Weights: the filter's whole integral, for 2 samples in each of 30 pixels.
     offsets = np.linspace(-2.5, 2.5, 2001, dtype=np.float32)
     profile = np.array(sensor.film().rfilter().eval(mi.Float(offsets)))
     integral = profile.sum() * (offsets[1] - offsets[0])

@@ -121,7 +121,7 @@ def test_a_file_in_place_is_not_sent(folder, tmp_path):
     made = Package.of(folder / "scenes" / "scene.xml")
     store = Store(tmp_path / "receiver")
     assert made.missing(store) == []
-    # Another file under the same name is.
+    # Another file with the same name is.
     shutil.copy(folder / "maps" / "other.exr", folder / "maps" / "heights.exr")
     assert [c.path for c in made.missing(store)] == [
         str(folder / "scenes" / ".." / "maps" / "heights.exr")

@@ -13,7 +13,7 @@ import pytest
 from tests.scenes.test_scenes import SCENES, load, repeatability
 
 # Scene, horizontal field of view, a window (fractions of rows and columns) that shows the material
-# alone, and parameters: maps so coarse that a small image resolves them, and next to no reliefs,
+# only, and parameters: maps so coarse that a small image resolves them, and almost no reliefs,
 # which repeat between two renders just as glints do.
 CASES = {
     "kettle_elements": (30, (0.50, 0.75, 0.25, 0.55), {"uv_scale": 0.5}),

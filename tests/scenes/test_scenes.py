@@ -17,7 +17,7 @@ from glintbsdf import NormalMap
 SCENES = Path(__file__).parents[2] / "scenes"
 
 # Scene, horizontal field of view in degrees, and a window (rows, columns; fractions of the image)
-# that shows metal only: no silhouette, which repeats between two renders just as glints do.
+# that shows metal only, without silhouettes, which repeat between two renders as glints do.
 CASES = {
     "curved_patch": (45, (0.25, 0.50, 0.25, 0.75)),
     "kettle": (30, (0.50, 0.75, 0.25, 0.55)),

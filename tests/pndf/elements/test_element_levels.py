@@ -58,7 +58,7 @@ def test_spread_is_roughness(variant, sigma):
     rougher = Elements(smooth_map(), float(np.hypot(0.02, spread)))
     query = Query(footprint(0.3, 0.6, sigma), spread=isotropic(spread))
     a, b = of_spread.eval(m, query).numpy(), rougher.eval(m, query.footprint).numpy()
-    # Larger footprints by lists, which reach as far as the elements without a spread
+    # Larger footprints use lists, which have the reach of the elements without a spread
     assert np.abs(a - b).sum() < (1e-5 if sigma < 1 else 0.03) * b.sum()
 
 
@@ -71,7 +71,7 @@ def test_turn_is_that_of_the_map(variant, sigma, curved):
     original = smooth_map(size, "clamp")
     centres = (np.arange(size) + 0.5) / size
     u, v = np.meshgrid(centres - u0, centres - v0)
-    # Far from the footprint, where nobody looks, normals stay inside the disk
+    # Far from the footprint, where no query is, normals stay inside the disk
     offset = np.clip(np.stack([u, v], -1), -0.2, 0.2)
     moved = original.normals - offset @ turn.T
     m, _ = grid()
@@ -83,8 +83,8 @@ def test_turn_is_that_of_the_map(variant, sigma, curved):
     b = b.eval(m, at).numpy()
     without = turned.eval(m, at).numpy()
     assert np.abs(without - b).sum() > 0.02 * b.sum()
-    # Flat elements of the moved map do not follow H within their own extent. Measured: 1e-6 and,
-    # by lists, 1.5e-3; flat 0.05.
+    # Flat elements of the moved map do not follow H within their extent. Measured: 1e-6, with lists
+    # 1.5e-3, and for flat elements 0.05.
     tolerance = 0.07 if not curved else 1e-5 if sigma < 1 else 3e-3
     assert np.abs(a - b).sum() < tolerance * b.sum()
 

@@ -92,8 +92,8 @@ def mixture(normal_map, step, sigma_r, curved, m, sigma_p):
 @pytest.mark.parametrize("curved", [True, False])
 @pytest.mark.parametrize("step", [0.5, 1.0])
 def test_mixture_in_float64(variant, step, curved, sigma_r):
-    # Normals in steps of 2⁻¹⁴ and places that float32 holds exactly, so that rounding on the way
-    # in, which no formula can undo, is not what is measured.
+    # Normals in steps of 2⁻¹⁴, and positions that float32 represents exactly, so that the rounding
+    # of the input, which no formula can undo, does not count.
     normals = np.round(MAP.normals * 2**14) / 2**14
     normal_map = NormalMap(normals.astype(np.float32))
     pndf = Elements(normal_map, sigma_r, step, curved)
@@ -213,7 +213,7 @@ def test_lists_leave_out_little(variant, monkeypatch, tune):
     for limit in (0, np.inf):
         tune(few_cells=limit)
         densities[limit] = pndf.eval(m, seen).numpy()
-    # Of normals drawn from D, the mean of a relative difference is the share of the mass.
+    # For normals drawn from D, the mean relative difference is the fraction of the mass.
     assert abs(np.mean(densities[0] / densities[np.inf]) - 1) < 1e-3
 
 
@@ -226,7 +226,7 @@ def test_mirroring_is_repetition_of_the_unfolded_map(variant):
     half = Footprint.isotropic(mi.Point2f(0.495, 0.7), 1 / 48)
     m = draw(mirrored, seen, 1000)
     a, b = mirrored.eval(m, seen).numpy(), repeated.eval(m, half).numpy()
-    # The cells of normals are others: 6e-4 of the mass was measured to differ.
+    # The cells of normals differ, and with them 6e-4 of the mass, as measured.
     assert np.abs(a / b - 1).mean() < 2e-3
 
 

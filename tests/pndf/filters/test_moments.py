@@ -95,7 +95,7 @@ def test_narrow_footprints_are_nearly_as_good(variant, name):
     first, second = relative_errors(
         normal_map, averages(pyramid(normal_map), uv, axes), slope_moments(normal_map, uv, axes)
     )
-    # As the module says; measured 2.5 % and 3.3 % on flakes, a third of that elsewhere.
+    # As in the module's docstring; measured 2.5 % and 3.3 % on flakes, a third of that elsewhere.
     assert np.sqrt((first**2).mean()) < 0.035 and np.sqrt((second**2).mean()) < 0.05
 
 
@@ -139,7 +139,7 @@ def test_small_variances_keep_their_digits(variant):
     chain = pyramid(NormalMap(normals))
     whole = Footprint.isotropic(mi.Point2f(0.5), 2.0)
     got = [float(x[0]) for x in chain.average(whole)[2:]]
-    # Of the mesh, which is smoother than its vertices: sums of 5 midpoints, as the module has it.
+    # The mesh is smoother than its vertices: sums over 5 midpoints, as in the module.
     n = [np.roll(s, (-i, -j), axis=(0, 1)) for i in (0, 1) for j in (0, 1)]
     edges = ((1, 2, 2), (0, 1, 1), (0, 2, 1), (1, 3, 1), (2, 3, 1))
     midpoints = np.concatenate(

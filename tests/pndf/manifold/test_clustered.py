@@ -49,7 +49,7 @@ def test_fit_is_exact_where_the_map_is_linear():
     vertices = np.stack([0.01 * j + 0.002 * i - 0.2, 0.01 * i - 0.003 * j], -1)
     for level, (normals, residual) in enumerate(fit_clusters(vertices, 1e-6, 4), 1):
         assert normals.shape == (32 >> level, 16 >> level, 4, 2)
-        # Rounding of float64, and of float32 in what is returned. An error of 1e-4 texels
+        # Rounding of float64, and of the float32 result. An error of 1e-4 texels
         # everywhere would give a residual of 1e-8 · 4^l.
         assert np.allclose(normals, cluster_corners(vertices, level), atol=3e-8)
         assert residual.max() < 1e-10 * 4**level
@@ -83,7 +83,7 @@ def test_fit_minimises_eq_7(epsilon):
             solution = np.linalg.lstsq(root * phi, root * n, rcond=None)[0]
             least = (weight * ((phi @ solution - n) ** 2).sum(1)).sum()
             ours = (weight * ((phi @ fitted[row, column] - n) ** 2).sum(1)).sum()
-            # What float32 normals can reach, at weights up to 1/epsilon.
+            # The accuracy of float32 normals, at weights up to 1/epsilon.
             rounding = weight.sum() * 1e-14
             assert ours <= least * (1 + 1e-5) + rounding
             assert np.isclose(residual[row, column], least, rtol=1e-5, atol=rounding)
@@ -131,7 +131,7 @@ def test_cuts_tile_the_lattice(shape):
         assert covered.max() <= 1
         count = sum(int(on.sum()) for on in cut) + (covered == 0).sum()
         assert count == element_count(shape[0] * shape[1], cut)
-        # Coarsest first: nothing on the cut lies in a cluster that would do.
+        # Coarsest first: no cluster of the cut lies in an acceptable larger one.
         for level in range(1, len(cut)):
             child = cut[level - 1]
             small = (residuals[level] <= threshold).repeat(2, 0).repeat(2, 1)
@@ -232,7 +232,7 @@ def test_lists_equal_the_loop_over_all_quads(variant, name, kernel):
     density, expected = pndf.eval(m, footprint).numpy(), sum_over_quads(pndf, m, footprint)
     used = np.unique(pndf.rung(pndf.texel_kernel(footprint)).numpy())
     assert np.array_equal(used, np.arange(len(used))) and len(used) > 1
-    # All but samples on the very edge of the kernel or of a clamped triangle.
+    # All except samples on the very edge of the kernel or of a clamped triangle.
     assert (density > 0).mean() > 0.995
     # Positions are rounded, so that a few terms are found in the quad beside their own.
     apart = np.abs(density - expected) > 1e-3 * (density + expected)

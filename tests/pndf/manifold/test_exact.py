@@ -60,7 +60,7 @@ def test_lists_equal_the_loop_over_all_quads(variant, tune, shape, wrap_mode):
     for few in (0, np.inf):
         tune(few_quads=few)
         density[few] = pndf.eval(m, footprint).numpy()
-    # Equal but for the order of the sum: 2e-6 was measured.
+    # Equal except for the order of the sum: 2e-6 was measured.
     assert np.allclose(density[0], density[np.inf], rtol=1e-5, atol=1e-3)
     assert (density[0] > 0).mean() > 0.998  # all but samples on the very edge of the kernel
 
@@ -79,7 +79,7 @@ def test_both_ways_give_the_same_where_they_meet(variant, tune, kernel):
     few = kernels.touched_quads().numpy() <= tuning().few_quads
     assert few.any() and not few.all() and (together > 0).mean() > 0.998
     tune(few_quads=np.inf)
-    # Equal but for the order of the sum, as above.
+    # Equal except for the order of the sum, as above.
     assert np.allclose(together, pndf.eval(m, footprint).numpy(), rtol=1e-5, atol=1e-3)
 
 
@@ -115,7 +115,8 @@ def test_mirroring_is_repetition_of_the_unfolded_map(variant):
     half = Footprint(footprint.uv / 2, footprint.du / 2, footprint.dv / 2)
     m = draw(mirrored, footprint, 1000)
     a, b = mirrored.eval(m, footprint).numpy(), repeated.eval(m, half).numpy()
-    # Positions are rounded differently: 1e-6 of three maps, which the edge of a kernel shows.
+    # Positions of up to three maps are rounded differently, by 1e-6, which shows at the kernel's
+    # edge.
     assert (np.abs(a - b) <= 1e-3 * (a + b)).mean() > 0.995
 
 
@@ -124,7 +125,7 @@ def test_far_outside_a_clamped_map_only_its_corner_is_seen(variant):
     pndf = Manifold(normal_map)
     footprint = Footprint.isotropic(mi.Point2f(-4, -5), 0.1)
     m = np.array(draw(pndf, footprint, 100))
-    # All triangles there are clamped ones around the corner's normal, of circumradius 6.2e-4.
+    # All triangles there are clamped, with circumradius 6.2e-4 around the corner's normal.
     assert np.abs(m - normal_map.normals[0, 0][:, None]).max() < 6.3e-4
 
 
@@ -164,10 +165,10 @@ def test_evaluation_and_sampling_find_the_same_triangles_degenerate(variant):
     footprint = Footprint.isotropic(mi.Point2f(0.3, 0.4), 0.2)
     s = np.array(draw(pndf, footprint, count))
     drawn = (np.abs(s - np.array(middle)[:, None]) < 1e-3).all(axis=0).mean()
-    half = 1.1 * equilateral(1e-9)[0][1]  # of a square about all of their normals
+    half = 1.1 * equilateral(1e-9)[0][1]  # half of a square around their normals
     s = np.array(middle)[:, None] + half * np.random.default_rng(4).uniform(-1, 1, (2, count))
     mass = pndf.eval(mi.Vector2f(np.float32(s)), footprint).numpy().mean() * (2 * half) ** 2
-    # 0.03: their noise is 2 %; half of the triangles had been drawn, but not evaluated.
+    # 0.03, as the noise is 2 %. An earlier error left out half of the triangles.
     assert 0.02 < drawn and abs(mass / drawn - 1) < 0.1
 
 

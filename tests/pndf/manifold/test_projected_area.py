@@ -133,8 +133,8 @@ KINDS = [
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_triangles(variant, kind):
-    # Relative error ≤ 1e-3 of every triangle, however little of it is seen, down to P = 1e-6: there
-    # float32 has lost the digits of the corner that is seen. Measured: 7e-4 with the low orders,
+    # Relative error ≤ 1e-3 of every triangle, however little of it is visible, down to P = 1e-6,
+    # where float32 has lost the digits of the visible corner. Measured: 7e-4 with the low orders,
     # where they are used, 4e-4 with the high one.
     rng = np.random.default_rng(KINDS.index(kind))
     count = 1000
@@ -167,7 +167,7 @@ def test_triangles(variant, kind):
 @pytest.mark.parametrize(
     "triangle",
     [
-        [(-0.2, 0.9), (-0.2, -0.9), (-0.9, 0.0)],  # an edge crosses, no corner is seen
+        [(-0.2, 0.9), (-0.2, -0.9), (-0.9, 0.0)],  # an edge crosses, no visible corner
         [(-0.2, 0.9), (-0.2, -0.9), (-0.31, 0.3)],  # two edges cross
         [(-0.2, 0.9), (-0.2, -0.9), (-0.31, 0.0)],  # three
         [(0.3, 0.0), (-0.6, 0.7), (-0.6, -0.7)],  # a corner, and the middle of the opposite edge
@@ -289,7 +289,7 @@ def test_footprints(variant, kernel):
 
 
 def test_large_footprints_are_sampled(variant):
-    # 16 times as many quads as are looked at. Measured: 1.2e-3 absolute.
+    # 16 times as many quads as are evaluated. Measured: 1.2e-3 absolute.
     mesh = TexelMesh(maps.isotropic(256, alpha=0.15, seed=3))
     footprint = Footprint.isotropic(mi.Point2f(0.3, 0.6), 40 / 256)
     assert mesh.texel_kernel(footprint).touched_quads()[0] > 8 * MANY_QUADS
@@ -341,9 +341,9 @@ def test_extremes(variant, estimate):
 
 def test_fit_of_two_facets(variant):
     # Facets of slope ±s side by side have P = (|ω_z + s·ω| + |ω_z − s·ω|)/2. The fit knows their
-    # variance alone, and at grazing angles takes slopes for evenly distributed: √3/4 of its root,
-    # where two facets have ½. The footprint is wide enough to see as much of one as of the other;
-    # the chain of averages sees the triangles between them as well, which are less steep.
+    # variance only, and at grazing angles assumes an even distribution of slopes, √3/4 of its root,
+    # while two facets have ½. The footprint is wide enough to cover equal areas of both facets; but
+    # the MIP chain also averages the triangles between them, which are less steep.
     slope = np.array([0.3, 0.1])
     normals = np.where(np.arange(64)[:, None] // 32 == 0, slope, -slope) / np.sqrt(
         1 + slope @ slope
@@ -411,7 +411,7 @@ def glints(normal_map: NormalMap, **parameters) -> mi.BSDF:
 
 @pytest.mark.parametrize("name", MASKING_MAPS)
 def test_furnace(variant, name):
-    # No footprint reflects more than it receives, at any angle: where P is not below the area of
+    # No footprint reflects more than it receives, at any angle, if P is not below the area of
     # the facets themselves. Worst of 1000 views of each kind, measured: 1.0015, of the brushed map.
     rng = np.random.default_rng(8)
     count, side = 120, 24
@@ -473,7 +473,7 @@ def test_masking_is_that_over_the_mean_plane(variant):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_masses_of_triangles(variant, kernel):
-    # The halves of all quads under a kernel have its mass, and each as much as points find there.
+    # The halves of all quads under a kernel have its mass, each as much as random points in it.
     rng = np.random.default_rng(3)
     for sigma in (0.02, 0.3, 1.0, 2.5):
         axes = sigma * np.array([[1.0, 0.4], [-0.3, 0.8]]) / 64
@@ -532,7 +532,7 @@ def test_derivative_is_that_of_the_value(variant):
 
 @pytest.mark.parametrize("parameters", [{"threshold": 3.0}, {"max_error": 0.2}], ids=str)
 def test_analytic_masking_of_approximate_pndfs(variant, parameters):
-    # Masking looks at the map's own facets, whatever stands for them in the P-NDF.
+    # Masking uses the map's own facets, whatever the P-NDF replaces them with.
     normal_map = maps.isotropic(128, seed=1)
     view = View(du=(0.12, 0.04), dv=(-0.04, 0.12), wi=(1, 0.5, 0.4))
     masked, unmasked = (

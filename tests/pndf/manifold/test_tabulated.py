@@ -125,7 +125,7 @@ def test_mixtures_of_splines(finest):
     period, count = 40 * finest, 2 * finest // 3
     functions = np.array([function_of_node(period, finest, count, k) for k in range(count)])
     assert np.allclose(functions.sum(0), 1, atol=1e-6)
-    if finest < 12:  # too short for a function that does not meet itself
+    if finest < 12:  # too short: the function would overlap itself
         return
     quad = np.arange(period) + 0.5
     for node in (1, 2):
@@ -260,7 +260,8 @@ def test_norm_of_the_interpolated_kernel(variant, pndf, kernel):
             smooth = splines[0] @ weights(nodes[0][:, None], nodes[1], narrowed) @ splines[1].T
             norms.append(np.abs(smooth / smooth.sum() - true).sum())
         share = np.mean(norms) / kernel_error(kernel, spacing)
-        # The fit is to within 12 %; with an edge, it has a margin, and places differ by a third.
+        # The fit is accurate to 12 %; for kernels with an edge it has a margin, and places differ
+        # by a third.
         assert (0.88 if kernel == "gaussian" else 0.4) < share < 1.12
 
 
