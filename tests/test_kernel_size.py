@@ -164,7 +164,7 @@ def test_simpler_kernels_are_shorter():
     assert box < disk < gaussian
 
 
-def test_filters_look_up_the_moments_they_need_only():
+def test_filters_look_up_only_the_moments_they_need():
     footprint = interaction()
     footprint = Footprint(footprint.uv, footprint.duv_dx, footprint.duv_dy)
     counts = {
@@ -182,7 +182,7 @@ def test_no_footprint_no_code_for_its_extent():
     assert evaluation(bsdf, partials=False) < evaluation(bsdf)
 
 
-def test_nobody_watches_unless_asked():
+def test_recorder_is_off_by_default():
     bsdf = make("glint_manifold", masking="none")
     alone = evaluation(bsdf)
     bsdf.watch = Recorder(bsdf.normal_map)

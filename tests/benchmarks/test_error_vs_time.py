@@ -30,7 +30,7 @@ def point(method, seconds, l1, noise=0.001):
     return {"method": method, "seconds_per_query": seconds, "l1": l1, "noise_l1": noise}
 
 
-def test_front_holds_what_nothing_beats():
+def test_front_has_the_undominated_points():
     from benchmarks.report import pareto
 
     points = [
@@ -44,7 +44,7 @@ def test_front_holds_what_nothing_beats():
     assert front == ["fast and rough", "between", "slow and exact"]
 
 
-def test_errors_within_their_noise_are_none():
+def test_errors_below_their_noise_count_as_zero():
     from benchmarks.report import pareto
 
     points = [point("noisy", 1.0, 0.08, noise=0.07), point("sure", 2.0, 0.04)]
@@ -241,7 +241,7 @@ def test_json_is_as_its_schema_says(report):
     jsonschema.Draft202012Validator(schema).validate(report)
 
 
-def test_everything_asked_for_is_there(folder, report):
+def test_report_is_complete(folder, report):
     assert [(unit["map"], unit["radius"]) for unit in report["pndf"]] == [
         ("flakes", 2),
         ("flakes", 8),

@@ -87,13 +87,13 @@ def test_nan_breaks_every_bound(stability, column):
     assert stability.Judge(10).cells(result)[column].broken
 
 
-def test_what_is_not_resolved_is_not_judged(stability):
+def test_unresolved_values_are_not_judged(stability):
     result = BROKEN["float64"] | BROKEN["NaN"] | {"errors": {}, "resolved": False}
     cells = stability.Judge(10).cells(result)
     assert cells["float64"] == stability.Cell("(2.0e-03)") and cells["NaN"].broken
 
 
-def test_what_fails_is_named(stability, tmp_path):
+def test_failures_are_named(stability, tmp_path):
     row = stability.Row("lean", "flat", "alpha", -1.0, quick=True)
     status, text = run(stability, [row], tmp_path)
     assert status == 1 and '"alpha" must be' in text

@@ -41,7 +41,7 @@ def test_round_trip(variant):
                 assert np.allclose(turn[i, j], expected[i, j], rtol=1e-4, atol=1e-4)
 
 
-def test_curvature_is_not_taken_for_it(variant):
+def test_curvature_is_not_mistaken_for_a_turn(variant):
     """An integrator that leaves the derivatives of normals in the interaction passes no turn."""
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
     si = curved_interaction(
@@ -54,7 +54,7 @@ def test_curvature_is_not_taken_for_it(variant):
 
 
 @pytest.mark.parametrize("to_uv", [None, "scaled"])
-def test_wrappers_hand_it_on(variant, to_uv):
+def test_wrappers_pass_it_on(variant, to_uv):
     """``twosided``, ``mask``, ``blendbsdf`` and a flat ``normalmap`` pass it to the glint BSDF
     inside."""
     transform = mi.ScalarTransform4f()

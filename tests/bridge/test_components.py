@@ -86,7 +86,7 @@ def test_each_side_gets_its_part(shared):
         assert dr.allclose(of_side, share * value) and dr.allclose(drawn, 0.5 * pdf)
 
 
-def test_one_component_is_asked_for(shared):
+def test_context_with_one_component(shared):
     """A context that names a component gets its part, and samples it alone."""
     si, bs, weight = suite.sample(load(), VIEW, 500)
     ctx = mi.BSDFContext()

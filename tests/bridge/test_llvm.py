@@ -52,11 +52,11 @@ def test_version_is_read_off_the_name(name, version):
     assert llvm._version(f"/nowhere/{name}") == version
 
 
-def test_version_that_the_name_does_not_tell_is_asked_for(usable):
+def test_version_from_the_library_itself(usable):
     assert llvm._ask_version(usable.path)[: len(usable.version)] == usable.version
 
 
-def test_library_without_the_question_is_too_old(too_old):
+def test_library_without_a_version_function_is_too_old(too_old):
     assert llvm._ask_version(too_old.path) is None
 
 
@@ -75,7 +75,7 @@ def test_find_sorts_from_new_to_old(monkeypatch, tmp_path):
     assert [library.usable for library in libraries] == [True, True, False, False]
 
 
-def test_a_named_library_is_respected(monkeypatch):
+def test_library_of_the_environment_is_kept(monkeypatch):
     monkeypatch.setenv(llvm.VARIABLE, "/my/libLLVM.so")
     monkeypatch.setattr(llvm, "find", pytest.fail)
     llvm.choose()

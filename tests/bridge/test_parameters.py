@@ -36,7 +36,7 @@ def test_choices_and_booleans(variant):
             parameters(a=value).boolean("a", True)
 
 
-def test_what_excludes_each_other_is_named(variant):
+def test_parameters_that_exclude_each_other_are_named(variant):
     def message(action) -> str:
         with pytest.raises(ParameterError) as caught:
             action()
@@ -53,7 +53,7 @@ def test_what_excludes_each_other_is_named(variant):
     )
 
 
-def test_a_missing_map_is_told_with_what_may_take_its_place(variant):
+def test_error_about_a_missing_map_names_alternatives(variant):
     begin = r'glint_test: one of "filename", "bitmap" or "data" must give the normal or height map'
     with pytest.raises(ParameterError, match=begin + r" \(got none of them\)"):
         parameters().normal_map()

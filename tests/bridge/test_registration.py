@@ -74,7 +74,7 @@ def test_scalar_variant_is_refused_with_the_lines_to_type(plugin):
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 keeps what a raise has left")
 @pytest.mark.parametrize("plugin", ["glint_grid", "glint_manifold", "glint_path"])
-def test_an_error_about_a_parameter_is_one_sentence_for_who_loads_a_scene(variant, plugin):
+def test_an_error_about_a_parameter_is_one_sentence(variant, plugin):
     with pytest.raises(RuntimeError) as error:
         mi.load_dict({"type": plugin, "wrong": 1})
     message = str(error.value)
@@ -82,7 +82,7 @@ def test_an_error_about_a_parameter_is_one_sentence_for_who_loads_a_scene(varian
     assert "Traceback" not in message and len(message.splitlines()) == 1
 
 
-def test_a_parameter_that_nothing_asks_for_is_refused(variant):
+def test_an_unused_parameter_is_refused(variant):
     with pytest.raises(RuntimeError, match='glint_manifold: "layer" is of no use beside the other'):
         mi.load_dict({**a_plugin(), "layer": "a"})
 

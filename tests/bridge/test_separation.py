@@ -172,7 +172,7 @@ def test_filters_are_smooth_already(variant):
     ["diffuse", "roughconductor", "conductor", "dielectric", "plastic", "roughplastic", "null",
      "thindielectric", "roughdielectric", "pplastic", "principled"],
 )  # fmt: skip
-def test_other_bsdfs_ignore_the_wish(variant, bsdf):
+def test_other_bsdfs_ignore_the_smooth_context(variant, bsdf):
     for a, b in zip(
         everything({"type": bsdf}, smooth_context()),
         everything({"type": bsdf}, mi.BSDFContext()),
@@ -332,7 +332,7 @@ def test_depths(variant):
     assert np.all(parts(scene, max_depth=2)[2] == 0)
 
 
-def test_off_asks_for_nothing_more(variant):
+def test_without_separation_no_smooth_lobes_are_evaluated(variant):
     """Without ``separate``, a BSDF is traced only for its glints, and there are no AOVs."""
     seen = []
 

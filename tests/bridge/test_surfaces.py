@@ -134,7 +134,7 @@ def test_a_mesh_without_uvs_is_refused_from_python_as_well(variant, folder, wher
 @pytest.mark.parametrize("left_handed", [False, True])
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("data", ["ours", "opposite"])
-def test_green_that_does_not_fit_the_surface_is_told(
+def test_green_that_does_not_fit_the_surface_is_reported(
     variant, folder, capfd, left_handed, mirrored, data
 ):
     """On left-handed UVs, or if to_uv mirrors, the second component points against the rows."""
@@ -148,7 +148,7 @@ def test_green_that_does_not_fit_the_surface_is_told(
         assert ('"flip_y" true turns it' in output) == (not fits and not options)
 
 
-def test_without_any_shape_there_is_an_end():
+def test_no_shapes():
     code = (
         "import glintbsdf, mitsuba as mi; mi.set_variant('llvm_ad_rgb');"
         "from glintbsdf.bridge import surfaces; print(list(surfaces.live_shapes()))"

@@ -43,7 +43,7 @@ def test_quadrature_finds_spikes_of_any_size(variant):
     assert suite.p_value(densities.count_in(cells, wider), len(test), mass, error) < 1e-5
 
 
-def test_quadrature_is_led_to_needles_by_few_samples(variant, monkeypatch):
+def test_quadrature_finds_narrow_spikes_by_few_samples(variant, monkeypatch):
     # Like 16 degenerate triangles: each has a thousandth of the mass, in a quarter of the square.
     rng = np.random.default_rng(2)
     centres, radius = rng.uniform(0.1, 0.9, (16, 2)), 1e-5

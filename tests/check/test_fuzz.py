@@ -27,7 +27,7 @@ def test_every_value_is_used_or_refused(variant):
     assert report.counts["refused"] > 300 and report.counts["used"] > 30
 
 
-def test_what_is_used_has_finite_values():
+def test_used_values_are_finite():
     """In separate processes, so that crashes and endless loops are outcomes, too."""
     report = fuzz(60, seed=4)
     assert not report.faults, str(report)

@@ -248,7 +248,7 @@ def test_files_of_the_scene_are_not_written_over(run, folder):
     assert (folder / "map.exr").read_bytes() == content
 
 
-def test_what_is_said_of_footprints_fits_the_scene(folder, variant, capfd):
+def test_warnings_about_footprints_fit_the_scene(folder, variant, capfd):
     """With an orthographic camera, and on a curve, pixel_spread gives no footprint."""
     parallel = SCENE.replace("perspective", "orthographic").replace(
         '<float name="fov" value="30"/>', ""
@@ -270,7 +270,7 @@ def test_what_is_said_of_footprints_fits_the_scene(folder, variant, capfd):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
-def test_a_full_disk_is_told(folder, variant, name):
+def test_a_full_disk_is_reported(folder, variant, name):
     """Mitsuba writes as much as fits, or nothing, without an error; the command reports it."""
     before = set(folder.iterdir())
     code = (

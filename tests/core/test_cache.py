@@ -73,7 +73,7 @@ def test_round_trip(folder):
 
 
 @pytest.mark.parametrize("value", ["off", ""])
-def test_off(folder, monkeypatch, value):
+def test_cache_off(folder, monkeypatch, value):
     monkeypatch.setenv("GLINTBSDF_CACHE", value)
     builder = Builder()
     for _ in range(2):

@@ -207,7 +207,7 @@ def test_hand_over_makes_the_levels_it_needs(variant):
     assert trimmed.nbytes < complete.nbytes
 
 
-def test_gate_lets_through_what_is_inside(variant):
+def test_gate_keeps_footprints_inside(variant):
     footprint = footprints()
     gate = Gate(normal_map(), recorded(normal_map(), footprint))
     through = gate(footprint, mi.Bool(True))
@@ -221,7 +221,7 @@ def test_gate_lets_through_what_is_inside(variant):
     [{"centre": (0.6, 0.3)}, {"centre": (0.4, 0.1)}, {"sigma": 1.5}, {"sigma": 3}],
     ids=["columns", "rows", "smaller", "larger"],
 )
-def test_gate_tells_what_is_outside_and_hands_on_something_inside(variant, other):
+def test_gate_notices_footprints_outside_and_replaces_them(variant, other):
     domain = recorded(normal_map(), footprints())
     gate = Gate(normal_map(), domain)
     through = gate(footprints(**other), mi.Bool(True))
@@ -233,7 +233,7 @@ def test_gate_tells_what_is_outside_and_hands_on_something_inside(variant, other
     assert found.smallest >= domain.smallest / 1.05 and found.largest <= domain.largest * 1.05
 
 
-def test_gate_does_not_mind_lanes_that_ask_nothing(variant):
+def test_gate_ignores_inactive_lanes(variant):
     gate = Gate(normal_map(), recorded(normal_map(), footprints()))
     gate(footprints(centre=(0.9, 0.9)), mi.Bool(False))
     assert not gate.missed()

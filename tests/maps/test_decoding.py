@@ -92,7 +92,7 @@ def test_encoding_can_be_stated():
         read(STORED, encoding="srgb")
 
 
-def test_what_is_no_normal_is_told(told):
+def test_invalid_normals_are_reported(told):
     read((STORED**2.2).astype(np.float32), encoding="unsigned")
     assert any("gamma was undone" in text for text in told())
 

@@ -83,7 +83,7 @@ def test_a_level_surface_has_smiths_masking(variant):
 
 
 @pytest.mark.parametrize("correlated", [True, False])
-def test_it_is_smooth_where_the_plane_turns_away(variant, correlated):
+def test_visibility_is_smooth_where_the_plane_turns_away(variant, correlated):
     p_i, p_o, plane_o = 0.05, 0.8, 0.7
     plane_i = mi.Float([1e-3, 1e-6, 1e-20, 0])
     v = np.array(visibility(p_i, plane_i, p_o, plane_o, correlated))

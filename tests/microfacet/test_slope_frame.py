@@ -126,7 +126,7 @@ def test_densities_keep_their_integral(variant):
     assert density.sum() * area == pytest.approx(1, abs=2e-3)
 
 
-def test_directions_see_what_they_saw(variant):
+def test_projected_area_is_kept(variant):
     frame = skewed()
     for _ in range(5):
         m = np.append(RNG.uniform(-0.5, 0.5, 2), 1)

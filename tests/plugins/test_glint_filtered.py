@@ -226,7 +226,7 @@ def test_lean_is_the_convolved_distribution_of_a_gaussian_map(variant):
     assert np.abs(actual - expected).sum() / expected.sum() < 0.05
 
 
-def test_stored_variance_ignores_what_lies_between_samples(variant):
+def test_variance_mapping_ignores_variance_between_lookups(variant):
     """At a point there is no variance, however rough the map is."""
     footprint = Footprint.isotropic(mi.Point2f(0.31, 0.57), 0.0)
     stored = Filtered(MAP, "variance", 0.1).lobe(footprint)

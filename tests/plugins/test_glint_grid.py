@@ -216,7 +216,7 @@ def test_variance_falls_as_density_grows(variant):
     assert np.allclose(np.array(deviations[2:-1]) / deviations[3:], 10, rtol=0.15)
 
 
-def test_far_away_all_is_smooth(variant):
+def test_large_footprints_are_smooth(variant):
     for name, parameters in SURFACES.items():
         si = scattered_interactions(1000, extent=100, sigma=100.0)
         values = relative_values(load(density=14.0, **parameters), beckmann(**parameters), si)

@@ -373,7 +373,7 @@ def test_probabilities_of_emitters(variant):
     assert abs(p[p < 1].max() - 2 / 5) < 1e-6
 
 
-def test_how_lights_are_seen(variant):
+def test_centre_and_variances_of_lights(variant):
     """Centre and variances of directions agree with points of the lights themselves."""
     scene = glints(
         a=ball_light((1, 2, 8), 0.5),

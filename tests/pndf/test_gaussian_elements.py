@@ -132,7 +132,7 @@ def appendix(d, s, jacobian, sigma_p, sigma_r):
 
 
 @pytest.mark.parametrize("sigma_r, slope", [(1e-2, 1.0), (1e-3, 1.0), (1e-4, 0.1), (1e-5, 0.01)])
-def test_the_papers_appendix_loses_what_ours_keeps(variant, sigma_r, slope):
+def test_the_papers_appendix_is_less_accurate_in_float32(variant, sigma_r, slope):
     """Its 4×4 matrices have entries like 1/σ_r², and in float32 their differences lose all
     digits."""
     rng = RNG(3)

@@ -50,7 +50,7 @@ def test_passes_the_shared_suite(bsdf, view):
     suite.check_furnace(bsdf, view)
 
 
-def test_is_rendered_and_told_from_the_register(waves):
+def test_renders_and_is_in_the_register(waves):
     image = suite.square({"type": "glint_waves", "pixel_spread": 1e-3})
     assert image.mean() > 0.1
     method = base.methods()["waves"]
@@ -76,7 +76,7 @@ def test_turn_and_spread_of_a_query(waves):
     )
 
 
-def test_a_query_makes_what_it_is_asked_for_once(variant):
+def test_a_query_computes_its_values_once(variant):
     from glintbsdf import Footprint
     from glintbsdf.footprint.query import Query
 

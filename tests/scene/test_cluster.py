@@ -241,7 +241,7 @@ def test_a_unit_that_is_too_large_is_halved(job, two, capsys, monkeypatch):
     assert halved.mean() == pytest.approx(expected.mean(), rel=0.05)
 
 
-def test_a_scene_that_is_too_large_is_told(job, two, monkeypatch):
+def test_a_scene_that_is_too_large_is_reported(job, two, monkeypatch):
     no_more_than(0, monkeypatch)
     with pytest.raises(ClusterError, match="needs more memory than they have"):
         image(job, two)

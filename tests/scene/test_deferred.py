@@ -82,7 +82,7 @@ def test_scenes_loaded_one_within_the_other_do_not_disturb_each_other(scene_file
         assert glossy and all(bsdf.pndf is None for bsdf in glossy)
 
 
-def test_a_structure_asked_outside_of_its_domain_tells(scene_file):
+def test_queries_outside_the_domain_are_noticed(scene_file):
     """The gate of a trimmed BSDF notices queries that it was not built for, and they are never
     answered wrongly."""
     inspected = inspection.load(scene_file)

@@ -127,7 +127,7 @@ def test_trimmed_rendering_is_the_same(folder, plugin, path):
 
 
 @pytest.mark.parametrize("part", ["columns", "rows", "smallest", "largest"])
-def test_a_survey_that_missed_something_costs_time_only(folder, monkeypatch, part):
+def test_an_incomplete_survey_only_costs_time(folder, monkeypatch, part):
     survey = inspection.survey
 
     def short_sighted(*arguments) -> list:
@@ -149,7 +149,7 @@ def test_a_survey_that_missed_something_costs_time_only(folder, monkeypatch, par
     assert np.array_equal(picture, image(inspected))
 
 
-def test_what_no_path_meets_is_not_built(folder):
+def test_structures_that_no_path_meets_are_not_built(folder):
     text = SCENE.replace('origin="0,0,4" target="0,0,0"', 'origin="0,0,4" target="0,0,9"')
     (folder / "scene.xml").write_text(text)
     inspected = load()
@@ -182,7 +182,7 @@ def run(capsys, monkeypatch, variant):
     return run
 
 
-def test_inspect_prints_what_is_asked_for_built_and_left_out(folder, run):
+def test_inspect_prints_queries_structures_and_features_left_out(folder, run):
     output, _ = run("inspect", "scene.xml")
     lines = output.splitlines()
     assert lines[0] == 'glint_manifold "metal"'

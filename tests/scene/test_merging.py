@@ -133,7 +133,7 @@ def test_time_limit(plan):
     assert 5 <= image.count <= 20
 
 
-def test_what_is_done_is_seen(plan):
+def test_observer_sees_every_unit(plan):
     seen = []
     image_of(plan, observe=lambda image: seen.append(image.count))
     assert seen == list(range(1, 81))
@@ -166,7 +166,7 @@ def test_a_checkpoint_stays_small(plan, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "exchanged"])
-def test_what_is_damaged_is_made_again(plan, tmp_path, damage):
+def test_damaged_files_are_made_again(plan, tmp_path, damage):
     with pytest.raises(ConnectionError):
         image_of(plan, Workers(1, 0, 60), checkpoint=checkpoint(tmp_path))
     for pattern in ("unit-*", "sums-*"):

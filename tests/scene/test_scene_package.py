@@ -149,7 +149,7 @@ def test_files_arrive_in_pieces(tmp_path, size):
     assert len(list(store.folder.iterdir())) == 1
 
 
-def test_what_is_not_as_promised_does_not_stay(tmp_path):
+def test_content_that_does_not_match_its_digest_is_removed(tmp_path):
     store = Store(tmp_path / "receiver")
     content = Content("0" * 40, ".exr", "/nowhere")
     with pytest.raises(BadPackage, match="another file"):
@@ -163,7 +163,7 @@ def test_what_is_not_as_promised_does_not_stay(tmp_path):
     "digest, suffix",
     [("../../etc/passwd", ""), ("0" * 39 + "/", ""), ("0" * 40, "/../../x"), ("0" * 40, ".a/b")],
 )
-def test_no_content_has_a_path_for_a_name(tmp_path, digest, suffix):
+def test_digest_and_suffix_contain_no_path(tmp_path, digest, suffix):
     content = Content(digest, suffix, "/nowhere")
     for action in (
         lambda: Store(tmp_path / "receiver").find(content),
@@ -177,7 +177,7 @@ def test_no_content_has_a_path_for_a_name(tmp_path, digest, suffix):
 @pytest.mark.parametrize(
     "name", ["../x.xml", "/etc/x.xml", "a/../../x.xml", "", ".", "..\\x.xml", "C:/x.xml", "link/x"]
 )
-def test_no_document_leads_out_of_the_folder(folder, tmp_path, name):
+def test_documents_stay_inside_the_folder(folder, tmp_path, name):
     (tmp_path / "inner").mkdir()
     (tmp_path / "inner" / "link").symlink_to(tmp_path)
     if name == "link/x":

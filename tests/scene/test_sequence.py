@@ -178,7 +178,7 @@ def test_a_video_needs_ffmpeg(run, folder, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell script stands for ffmpeg")
-def test_what_ffmpeg_gets(run, folder, monkeypatch):
+def test_input_of_ffmpeg(run, folder, monkeypatch):
     """A program in place of ffmpeg records its input."""
     program = folder / "bin" / "ffmpeg"
     program.parent.mkdir()

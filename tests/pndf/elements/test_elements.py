@@ -279,7 +279,7 @@ def test_balanced_flakes_cover_evenly(variant):
     assert np.abs(weights.sum(1) * (n * n / count) - 1).max() > 0.05
 
 
-def test_flakes_have_the_roughness_asked_for(variant):
+def test_flakes_have_the_requested_roughness(variant):
     pndf = Flakes(20_000, 0.2, 1e-4)
     slopes = pndf.flake_normals / np.sqrt(1 - (pndf.flake_normals**2).sum(1, keepdims=True))
     assert np.allclose(slopes.var(axis=0), 0.2**2 / 2, rtol=0.05)  # 20,000 draws: 1 %

@@ -66,7 +66,7 @@ def test_lists_equal_the_loop_over_all_quads(variant, tune, shape, wrap_mode):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_both_ways_give_the_same_where_they_meet(variant, tune, kernel):
+def test_lists_and_loop_agree_around_few_quads(variant, tune, kernel):
     """For footprints around few_quads, where each lane chooses one of two sums, both sums are
     equal."""
     normal_map = maps.isotropic(64, seed=1)

@@ -284,7 +284,7 @@ def test_predicted_error(variant, name, kernel):
     assert 0.45 < np.mean(ratios) < 1
 
 
-def test_tables_stand_back_for_data_with_derivatives(variant):
+def test_tables_are_not_used_for_data_with_derivatives(variant):
     normal_map = maps.isotropic(48, seed=1)
     tabulated = TabulatedManifold(normal_map, epsilon=EPSILON, max_error=0.1)
     dr.enable_grad(tabulated.data)
