@@ -18,7 +18,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # mathematics without a network
     "sphinx_click",
     "sphinx_copybutton",
     "sphinx_tabs.tabs",
