@@ -201,6 +201,45 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
 }
 
 
+#: Names that other renderers have for our parameters, without underscores; those that fit best come
+#: first. The page "Names in other renderers" explains them.
+OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    "roughness": ("alpha", "sigma_r"),
+    "flakeroughness": ("sigma_r", "detail_alpha"),
+    "flakeglossiness": ("sigma_r", "detail_alpha"),
+    "glitterroughness": ("sigma_r", "detail_alpha"),
+    "glossiness": ("alpha", "sigma_r"),
+    "flakeorientation": ("flake_alpha", "alpha"),
+    "normalrandomize": ("flake_alpha", "alpha"),
+    "flakenormalrandomize": ("flake_alpha", "alpha"),
+    "flakeamount": ("flake_density", "density"),
+    "flakesize": ("flake_density", "density"),
+    "glitterdensity": ("density", "flake_density"),
+    "glittersize": ("density", "flake_density"),
+    "flakeseed": ("seed",),
+    "randomseed": ("seed",),
+    "basecolor": ("specular_reflectance", "reflectance"),
+    "color": ("specular_reflectance", "reflectance"),
+    "flakecolor": ("colors", "specular_reflectance"),
+    "glittercolor": ("colors", "specular_reflectance"),
+    "albedo": ("reflectance", "specular_reflectance"),
+    "flakescale": ("to_uv",),
+    "uvscale": ("to_uv",),
+    "scale": ("to_uv",),
+    "bumpheight": ("height_scale",),
+    "bumpscale": ("height_scale",),
+    "displacementscale": ("height_scale",),
+    "normalstrength": ("strength",),
+    "normalscale": ("strength",),
+    "flipgreen": ("flip_y",),
+    "normalmap": ("filename",),
+    "heightmap": ("filename",),
+    "texture": ("filename",),
+    "file": ("filename",),
+    "ior": ("int_ior",),
+}
+
+
 def declared(owner: str, name: str) -> Number | Kind | None:
     """The declaration of a parameter, or None where there is none."""
     return PARAMETERS.get(owner, {}).get(name)
@@ -226,7 +265,9 @@ class Parameters:
             return
         for name in self.props.keys():
             if name not in known and name != "deferred":  # the loader of a scene sets this one
-                alike = get_close_matches(name, known, 1, 0.6)
+                others = OTHER_NAMES.get(name.lower().replace("_", ""), ())
+                alike = [other for other in others if other in known]
+                alike = alike or get_close_matches(name, known, 1, 0.6)
                 hint = f', did you mean "{alike[0]}"?' if alike else f": it has {', '.join(known)}"
                 raise ParameterError(f'{self.owner}: "{name}" is not a parameter{hint}')
 
