@@ -11,7 +11,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-_LINE = 64  # bytes
+from glintbsdf.core.alignment import aligned
 
 
 def opaque(kind: type, value):
@@ -19,13 +19,10 @@ def opaque(kind: type, value):
     return kind(value) if dr.is_array_v(value) else dr.opaque(kind, value)
 
 
-def aligned(values: np.ndarray) -> np.ndarray:
-    """``values``, or a copy of them that begins at a cache line."""
-    values = np.ascontiguousarray(values)
-    if values.ctypes.data % _LINE == 0:
-        return values
-    memory = np.empty(values.nbytes + _LINE, np.uint8)
-    begin = -memory.ctypes.data % _LINE
-    copy = memory[begin : begin + values.nbytes].view(values.dtype).reshape(values.shape)
-    copy[...] = values
-    return copy
+def stored(kind: type, values: np.ndarray):
+    """A Dr.Jit array of the type ``kind`` with the content of a NumPy array.
+
+    Its memory begins at a cache line, so that kernels which read it do not depend on where NumPy
+    happened to put the array.
+    """
+    return kind(aligned(values))

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.opaque import aligned
+from glintbsdf.core.alignment import aligned
 
 #: Quads are grouped in square blocks of this side. A power of two.
 BLOCK = 8

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from glintbsdf.core.alignment import aligned
 from glintbsdf.core.errors import check, check_choice
 from glintbsdf.core.messages import inform, warn
 from glintbsdf.maps.decoding import (
@@ -105,7 +106,7 @@ class NormalMap:
         )
 
         with np.errstate(over="ignore"):  # too large for float32 is infinite, and refused below
-            normals = np.array(normals, dtype=np.float32, order="C")
+            normals = aligned(np.array(normals, dtype=np.float32, order="C"))
             squared_length = np.einsum("ijk,ijk->ij", normals, normals, dtype=np.float64)
         finite = np.isfinite(normals).all(axis=2)
         check_texels(

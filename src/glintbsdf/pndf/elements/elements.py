@@ -24,6 +24,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import stored
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
@@ -529,7 +530,7 @@ class Elements(Mixture):
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
         self.wrap_mode = normal_map.wrap_mode
-        self.data = mi.TensorXf(normal_map.normals) if data is None else data
+        self.data = stored(mi.TensorXf, normal_map.normals) if data is None else data
         self.changed = data is not None
         self.sigma_r = mi.Float(sigma_r)
         if self.changed:  # otherwise another map would need another kernel

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import ParameterError, check, check_whole
+from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice
 from glintbsdf.maps.poisson_disk import balanced_areas, cells_for, poisson_disk
@@ -121,7 +122,7 @@ class Flakes(Mixture):
         self.variance = (SIGMA_H * n / sqrt(self.count)) ** 2
         self.lattice = Lattice(n, n, "repeat")
         self.places, self.deviates = flakes["places"], flakes["deviates"]
-        self.areas = mi.Float(flakes["areas"].ravel())
+        self.areas = stored(mi.Float, flakes["areas"].ravel())
         self.exist = flakes["areas"].ravel() > 0
         self.densest = float(flakes["densest"])
         self.turn(alpha)

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
@@ -229,7 +230,7 @@ class Filtered(PNDF):
         self.alpha = None if alpha is None else mi.Float(alpha)
         self.max_alpha = 1.0 if method == "toksvig" else inf
         self.check_alpha()
-        self.data = mi.TensorXf(normal_map.normals)
+        self.data = stored(mi.TensorXf, normal_map.normals)
         self.normal_map = normal_map
         self.build(domain)
 

@@ -23,6 +23,7 @@ import mitsuba as mi
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import coherent_vertex, gaussian, pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.gaussian import is_literal_zero
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
@@ -341,7 +342,7 @@ class Palette:
     def __init__(self, colors) -> None:
         self.count = len(colors)
         self.mean = tuple(float(x) for x in colors.mean(0))
-        self.colors = mi.Float(colors.ravel())
+        self.colors = stored(mi.Float, colors.ravel())
 
     def pick(self, u: mi.Float) -> mi.Color3f:
         """The colour at the fraction ``u``, in [0, 1), of the way through the image."""

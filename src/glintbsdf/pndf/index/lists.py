@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.core.opaque import aligned
+from glintbsdf.core.opaque import stored
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
@@ -148,7 +148,7 @@ class Packed:
         self.half = values.dtype == np.uint16
         if self.half:
             values = np.append(values, np.zeros(len(values) % 2, np.uint16)).view(np.uint32)
-        self.words = mi.UInt32(values)
+        self.words = stored(mi.UInt32, values)
         self.nbytes = values.nbytes
 
     def __getitem__(self, item):
@@ -181,8 +181,8 @@ class NormalCells:
             [dr.opaque(mi.Float, float(x)) for x in values] for values in (self.lower, self.scale)
         )
         self.count = dr.opaque(mi.UInt32, self.divisions)
-        self.slab_of_x = mi.UInt32(slab_of_x.astype(np.uint32))
-        self.cell_of_y = mi.UInt32(cell_of_y.astype(np.uint32).ravel())
+        self.slab_of_x = stored(mi.UInt32, slab_of_x.astype(np.uint32))
+        self.cell_of_y = stored(mi.UInt32, cell_of_y.astype(np.uint32).ravel())
 
     @staticmethod
     def histogram(normals: np.ndarray, lower, upper) -> np.ndarray:
@@ -241,7 +241,7 @@ class NormalCells:
         ]
         x = self.lower[0] + slabs / self.scale[0]
         y = self.lower[1] + np.concatenate(cells) / self.scale[1]
-        return mi.Float(x.astype(np.float32)), mi.Float(y.astype(np.float32))
+        return stored(mi.Float, x.astype(np.float32)), stored(mi.Float, y.astype(np.float32))
 
 
 class Span(NamedTuple):
@@ -311,7 +311,7 @@ class QuadLists:
         )
         # Taken out one by one: a large map then never has two copies of more than one array.
         self.entries, self.offset = Packed(arrays.pop("entries")), Packed(arrays.pop("offset"))
-        self.start = mi.UInt32(arrays.pop("start"))
+        self.start = stored(mi.UInt32, arrays.pop("start"))
         self.nbytes = self.entries.nbytes + self.offset.nbytes + 4 * dr.width(self.start)
 
     def covers(self, m):
@@ -505,9 +505,7 @@ class Builder:
         """Memory of the lists with this many divisions, estimated from a sample of blocks."""
         self.use(divisions)
         sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
-        row, column = (
-            mi.UInt32(aligned(v.astype(np.uint32))) for v in divmod(sample, self.columns)
-        )
+        row, column = (stored(mi.UInt32, v.astype(np.uint32)) for v in divmod(sample, self.columns))
         counter = dr.zeros(mi.UInt32, 1)
         self.scan(row, column, lambda cell: mi.UInt32(0), counter)
         entries = counter[0] / (len(sample) * self.blocks.mean_count)
@@ -527,7 +525,7 @@ class Builder:
         row = block // columns
         column = block - row * columns
         cells, width = (dr.opaque(mi.UInt32, n) for n in shape[1:])
-        counters = mi.UInt32(aligned(counters.ravel()))
+        counters = stored(mi.UInt32, counters.ravel())
         filled = None if entries is None else dr.zeros(mi.UInt32, max(int(entries), 1))
         self.scan(
             row + dr.opaque(mi.UInt32, strip.start),

@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check
-from glintbsdf.core.opaque import opaque
+from glintbsdf.core.opaque import opaque, stored
 from glintbsdf.core.progress import progress
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
@@ -261,14 +261,15 @@ class Ladder:
     def __init__(self, lattice: ClusterLattice, arrays: dict[str, np.ndarray]) -> None:
         self.lattice, self.thresholds = lattice, [float(t) for t in arrays["thresholds"]]
         self.levels = lattice.first.index(len(arrays["residuals"])) - 1
-        self.residuals = mi.Float(arrays["residuals"])
+        self.residuals = stored(mi.Float, arrays["residuals"])
         self.entries, self.offset = Packed(arrays["entries"]), Packed(arrays["offset"])
         for name in ("start", "elements", "first_of_row", "slab_of_x", "cell_of_y"):
-            setattr(self, name, mi.UInt32(arrays[name].ravel()))
-        self.allowed, self.shifts = mi.Float(arrays["thresholds"]), mi.UInt32(arrays["shifts"])
+            setattr(self, name, stored(mi.UInt32, arrays[name].ravel()))
+        self.allowed = stored(mi.Float, arrays["thresholds"])
+        self.shifts = stored(mi.UInt32, arrays["shifts"])
         self.divisions, self.begins = (
-            mi.UInt32(arrays["divisions"]),
-            mi.UInt32(arrays["begin"].ravel()),
+            stored(mi.UInt32, arrays["divisions"]),
+            stored(mi.UInt32, arrays["begin"].ravel()),
         )
         lower = arrays["lower"]
         scale = (RESOLUTION / (arrays["upper"] - lower)).astype(np.float32)
@@ -432,8 +433,8 @@ class BlocksOfElements(Blocks):
         self.mean_count = len(column) / (self.rows * self.columns)
         self.largest_entry = np.diff(self.first[:: self.columns]).max()
         self.triangles_of_element = triangles
-        self.device_first = mi.UInt32(self.first.astype(np.uint32))
-        self.device_elements = mi.UInt32(self.elements.ravel())
+        self.device_first = stored(mi.UInt32, self.first.astype(np.uint32))
+        self.device_elements = stored(mi.UInt32, self.elements.ravel())
 
     def first_of(self, block_row, block_column, offset=0):
         """Index of the first element of a block, or of the one ``offset`` blocks further on."""
@@ -538,7 +539,9 @@ class ClusteredManifold(Manifold):
         vertices_of_quads = self.vertices
 
         def triangles_of(normals):
-            self.vertices = dr.concat([dr.detach(vertices_of_quads), mi.Float(normals.ravel())])
+            self.vertices = dr.concat(
+                [dr.detach(vertices_of_quads), stored(mi.Float, normals.ravel())]
+            )
             return self.element_triangles
 
         # r_x r_y τ of the largest footprint, with the widest kernel.
@@ -551,7 +554,7 @@ class ClusteredManifold(Manifold):
         self.vertices = vertices_of_quads
         if len(arrays["thresholds"]):
             self.ladder = Ladder(self.clusters, arrays)
-            normals = mi.Float(arrays["normals"].ravel())
+            normals = stored(mi.Float, arrays["normals"].ravel())
             self.vertices = dr.concat([mi.Float(vertices_of_quads), normals])
 
     def element_normals(self, row, column, level, active):

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
 from glintbsdf.footprint.lattice import Lattice, floor_int
@@ -214,7 +215,7 @@ class TexelMesh:
         check(0 < epsilon < 1, owner, "epsilon", "a number in (0, 1)", epsilon)
         self.normal_map, self.kernel, self.epsilon = normal_map, kernel, float(epsilon)
         self.owner = owner
-        self.data = mi.TensorXf(normal_map.normals)
+        self.data = stored(mi.TensorXf, normal_map.normals)
         self.make_vertices()
 
     def make_vertices(self) -> None:

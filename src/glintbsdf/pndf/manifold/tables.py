@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.opaque import opaque
+from glintbsdf.core.opaque import opaque, stored
 from glintbsdf.core.progress import progress
 from glintbsdf.core.tuning import usable_cores
 from glintbsdf.footprint.lattice import floor_int
@@ -391,7 +391,7 @@ class NormalTables:
         self.correlation_lengths = arrays["correlation_lengths"].tolist()
         self.mixed = mixed_levels(self.counts)
         self.variances = [variances_of(periods, count, self.counts[0]) for count in self.counts]
-        self.rows = mi.UInt32(arrays["rows"])
+        self.rows = stored(mi.UInt32, arrays["rows"])
         filled = int((arrays["rows"] != self.EMPTY).sum())
         tiles = [filled * y * x for y, x in map(tiles_of, self.counts)]
         entries = np.diff([*arrays["starts"][:, 0], len(arrays["entries"])])
@@ -406,11 +406,12 @@ class NormalTables:
             mi.Float([spline_variance(n, axis[0]) for n in axis])
             for axis in zip(*self.counts, strict=True)
         )
-        self.first_word = mi.UInt32(np.cumsum([0, *tiles])[:-1])
-        self.words, self.starts = mi.UInt32(arrays["words"]), mi.UInt32(arrays["starts"].ravel())
+        self.first_word = stored(mi.UInt32, np.cumsum([0, *tiles])[:-1].astype(np.uint32))
+        self.words = stored(mi.UInt32, arrays["words"])
+        self.starts = stored(mi.UInt32, arrays["starts"].ravel())
         entries = arrays.pop("entries")
         padded = np.append(entries, np.zeros(len(entries) % 2, np.float16))
-        self.entries = mi.UInt32(padded.view(np.uint32))
+        self.entries = stored(mi.UInt32, padded.view(np.uint32))
 
     @property
     def levels(self) -> int:
