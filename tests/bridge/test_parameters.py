@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from glintbsdf import ParameterError
-from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.parameters import OTHER_NAMES, PARAMETERS, Parameters
 from glintbsdf.microfacet.interface import Conductor, Dielectric, Mirror
 
 
@@ -160,3 +160,27 @@ def test_spectra(each_variant):
         assert np.allclose(np.array(given.interface.eta.eval(si)), 1.5)
     assert isinstance(Parameters(mi.Properties("glint_test")).interface(), Mirror)
     assert isinstance(parameters(int_ior=1.5).interface(), Dielectric)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "name", "ours"),
+    [
+        ("glint_elements", "flake_roughness", "sigma_r"),
+        ("glint_elements", "Flake_Orientation", "flake_alpha"),
+        ("glint_grid", "flake_roughness", "detail_alpha"),
+        ("glint_grid", "glitter_density", "density"),
+        ("glint_filtered", "roughness", "alpha"),
+        ("glint_manifold", "normalStrength", "strength"),
+        ("glint_diffuse", "base_color", "reflectance"),
+    ],
+)
+def test_names_of_other_renderers_are_known(variant, plugin, name, ours):
+    with pytest.raises(RuntimeError, match=f'"{name}" is not a parameter, did you mean "{ours}"'):
+        mi.load_dict({"type": plugin, name: 0.5})
+
+
+def test_other_names_lead_to_parameters():
+    known = set().union(*PARAMETERS.values())
+    for name, ours in OTHER_NAMES.items():
+        assert set(ours) <= known
+        assert name == name.lower() and "_" not in name
