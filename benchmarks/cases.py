@@ -17,7 +17,7 @@ from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.core.garbage import collect_former_scenes
 from glintbsdf.maps.quilting import synthesise
 from glintbsdf.pndf.manifold.mesh import TexelMesh
-from glintbsdf.scene.rendering import pixel_angle
+from glintbsdf.scene.rendering import pixel_spread
 
 # --------------------------------------------------------------------------------------------------
 #  Maps
@@ -275,7 +275,7 @@ def spread_for(radius: float, texels: int, size: int) -> float:
     area = np.abs(np.array(si.duv_dx.x * si.duv_dy.y - si.duv_dx.y * si.duv_dy.x))
     area = area[np.array(si.is_valid()) & (area > 0)]
     seen = 3 * 0.5 * texels * UV_SCALE * np.sqrt(np.median(area))
-    return radius / seen * pixel_angle(sensor)
+    return radius / seen * pixel_spread(sensor)
 
 
 def picture_of(

@@ -16,7 +16,7 @@ from benchmarks.harness import Run, family, timed
 from benchmarks.measures.images import in_turn
 from benchmarks.methods import METHODS, Method, rough
 from glintbsdf import NormalMap
-from glintbsdf.scene.rendering import pixel_angle
+from glintbsdf.scene.rendering import pixel_spread
 
 #: Sizes of footprints on the curved patch, pixels.
 PIXELS = (1 / 16, 1, 4)
@@ -32,7 +32,7 @@ def on_patch(
     once."""
     shared = {"material": "Cr", "to_uv": scaled(UV_SCALE)}
     smooth = curved_patch(rough(normal_map, **shared), size, 16)
-    angle = pixel_angle(smooth.sensors()[0])
+    angle = pixel_spread(smooth.sensors()[0])
     material = method.describe(Surface("patch", normal_map)) | shared | {"pixel_spread": angle}
     glints, loading = timed(lambda: curved_patch(material, size, 16))
     parameters = mi.traverse(glints)

@@ -18,7 +18,7 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.microfacet.frame import normal_from_projection
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
-from glintbsdf.scene.rendering import pixel_angle
+from glintbsdf.scene.rendering import pixel_spread
 
 # --------------------------------------------------------------------------------------------------
 #  Fig. 8
@@ -171,7 +171,7 @@ def diffuse_errors(scale: float, size: int, many: int, run: Run) -> list[dict]:
     usual = {"type": "normalmap", "bsdf": {"type": "diffuse"},
              "normalmap": texture | {"to_uv": to_uv}}  # fmt: skip
     ours = {"type": "glint_diffuse", "data": mi.TensorXf(normal_map.normals), "to_uv": to_uv}
-    spread = pixel_angle(diffuse_plane(usual, size).sensors()[0])
+    spread = pixel_spread(diffuse_plane(usual, size).sensors()[0])
 
     def render(bsdf: dict, spp: int, block: int = 64) -> np.ndarray:
         scene, passes = diffuse_plane(bsdf, size), max(spp // block, 1)

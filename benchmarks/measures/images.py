@@ -19,7 +19,7 @@ from benchmarks.cases import Surface, curved_patch, scaled
 from benchmarks.harness import ratios_to_first, seconds, seconds_in_turn, timed
 from benchmarks.methods import BASELINES, Method
 from glintbsdf.check.truth import Truth, reference_render
-from glintbsdf.scene.rendering import pixel_angle
+from glintbsdf.scene.rendering import pixel_spread
 
 #: Radius of the lights; brute force finds the scene's smaller ones too rarely.
 LIGHT_RADIUS = 0.07
@@ -146,7 +146,7 @@ def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
     parameters = mi.traverse(scene)
     for key in (key for key in parameters.keys() if key.endswith("pixel_spread")):
         # Opaque, so that one kernel serves all numbers of samples.
-        parameters[key] = dr.opaque(mi.Float, pixel_angle(scene.sensors()[0]) / spp**0.5)
+        parameters[key] = dr.opaque(mi.Float, pixel_spread(scene.sensors()[0], spp))
     parameters.update()
 
     image, taken = timed(lambda: mi.render(scene, spp=spp, seed=seed))

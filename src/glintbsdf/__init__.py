@@ -24,15 +24,25 @@ if TYPE_CHECKING:
     from glintbsdf.core.errors import ParameterError
     from glintbsdf.footprint.gaussian import Footprint
     from glintbsdf.maps.normalmap import NormalMap
+    from glintbsdf.scene.rendering import pixel_spread
 
 __version__ = "0.1.0"
 
-__all__ = ["Footprint", "NormalMap", "ParameterError", "maps", "pndf", "reference"]
+__all__ = [
+    "Footprint",
+    "NormalMap",
+    "ParameterError",
+    "maps",
+    "pixel_spread",
+    "pndf",
+    "reference",
+]
 
 _HOMES = {
     "Footprint": "footprint.gaussian",
     "NormalMap": "maps.normalmap",
     "ParameterError": "core.errors",
+    "pixel_spread": "scene.rendering",
 }
 
 

@@ -358,15 +358,15 @@ def footprint_parameters(scene: mi.Scene) -> tuple[float, float]:
     return spread, sigma
 
 
-def test_pixel_angle_is_that_of_the_field_of_view(folder, variant):
+def test_pixel_spread_is_that_of_the_field_of_view(folder, variant):
     sensor = rendering.load_scene("scene.xml", {"size": "256"}).sensors()[0]
     expected = 2 * np.tan(np.radians(30) / 2) / 256
     # Differences of two unit vectors in float32, 6e-8 of 2e-3.
-    assert rendering.pixel_angle(sensor) == pytest.approx(expected, rel=1e-4)
+    assert rendering.pixel_spread(sensor) == pytest.approx(expected, rel=1e-4)
 
 
-def test_pixel_angle_of_a_parallel_projection_is_zero(variant):
-    assert rendering.pixel_angle(mi.load_dict({"type": "orthographic"})) == 0
+def test_pixel_spread_of_a_parallel_projection_is_zero(variant):
+    assert rendering.pixel_spread(mi.load_dict({"type": "orthographic"})) == 0
 
 
 @pytest.mark.parametrize("own_spread", [0.0, 0.01])
@@ -378,7 +378,7 @@ def test_bsdfs_get_the_footprint_of_the_whole_image(folder, variant, own_spread)
         spread, sigma = footprint_parameters(scene)
     assert footprint_parameters(scene) == before
     assert sigma == 0.5
-    assert spread == pytest.approx(own_spread or rendering.pixel_angle(sensor) / 4, rel=1e-5)
+    assert spread == pytest.approx(own_spread or rendering.pixel_spread(sensor) / 4, rel=1e-5)
 
 
 def test_mean_of_passes_is_the_image(folder, variant, monkeypatch):

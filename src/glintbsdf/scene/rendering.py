@@ -109,19 +109,26 @@ def glint_bsdfs(scene: mi.Scene) -> list:
     return [node for node in mi.traverse(scene).hierarchy if isinstance(node, FootprintBSDF)]
 
 
-def pixel_angle(sensor: mi.Sensor) -> float:
-    """Return the angle in radians that a pixel subtends in the middle of the sensor's image.
+def pixel_spread(sensor: mi.Sensor, spp: int = 1) -> float:
+    """The parameter ``pixel_spread`` for an image with ``spp`` samples per pixel, radians.
 
-    It is the geometric mean of both axes. It comes from the ray differentials of the sensor, so
-    that it holds for any projection and crop. Parallel projections have 0.
+    It is the angle that a pixel subtends in the middle of the sensor's image, over √spp, as Mitsuba
+    scales ray differentials. The angle is the geometric mean of both axes. It comes from the ray
+    differentials of the sensor, so it holds for any projection and crop. Parallel projections have
+    0.
+
+    Raises:
+        ValueError: ``spp`` is less than 1.
     """
+    if spp < 1:
+        raise ValueError(f"pixel_spread: spp must be a whole number ≥ 1 (got {spp})")
     middle = mi.Point2f(0.5)
     time, wavelength = mi.Float(0), mi.Float(0.5)
     ray, _ = sensor.sample_ray_differential(time, wavelength, middle, middle)  # type: ignore[arg-type]
     if not ray.has_differentials:
         return 0.0
     squared = dr.squared_norm(ray.d_x - ray.d) * dr.squared_norm(ray.d_y - ray.d)
-    return float(np.asarray(dr.sqrt(dr.sqrt(squared))).item())
+    return float(np.asarray(dr.sqrt(dr.sqrt(squared))).item()) / spp**0.5
 
 
 def chosen_sensor(scene: mi.Scene, which: str = "") -> mi.Sensor:
@@ -157,7 +164,7 @@ def footprints(scene: mi.Scene, sensor: mi.Sensor, spp: int) -> Iterator[None]:
     parameters = mi.traverse(scene)
     parameters.keep([r".*pixel_spread$"])
     original = {key: mi.Float(parameters[key]) for key in parameters.keys()}
-    spread = pixel_angle(sensor) / spp**0.5
+    spread = pixel_spread(sensor, spp)
     for key, own in original.items():
         parameters[key] = dr.select(own > 0, own, spread)
     parameters.update()
