@@ -29,12 +29,12 @@ class VariantError(RuntimeError):
 def register_plugin(plugin_type: str, made: Callable[[mi.Properties], object]) -> None:
     """Register a plugin in the active variant.
 
-    ``made``: the plugin's class, or whatever makes it of its properties. An integrator is known by
-    its type, see ``_INTEGRATORS``, or by its class; all else are BSDFs.
+    ``made``: the plugin's class, or a function that makes the plugin from its properties. The types
+    in ``_INTEGRATORS`` and classes of integrators are registered as integrators, all others as
+    BSDFs.
 
-    An error about a parameter, or about one that nothing asks for, reaches who loads the scene as
-    one sentence. Of other errors Mitsuba tells Python's traceback first, and then what they say; in
-    Python 3.10, of all.
+    Whoever loads the scene gets an error about a parameter as one sentence. For all other errors
+    Mitsuba prints Python's traceback before the message; Python 3.10 has the traceback always.
     """
 
     def make(props: mi.Properties) -> object:
