@@ -53,8 +53,8 @@ class MakesOpaque:
 
 
 class RefusesDerivatives:
-    """A callback of ``traverse`` that raises :class:`~.ParameterError` where derivatives are asked
-    for that there are none of: they would be zero without a word."""
+    """A callback of ``traverse`` that raises :class:`~.ParameterError` if derivatives are enabled
+    for a parameter that has none, as they would silently be zero."""
 
     def __init__(self, owner: str) -> None:
         self.owner = owner
@@ -121,7 +121,7 @@ class FootprintBSDF(mi.BSDF):
         return {}
 
     def left_out(self) -> list[str]:
-        """What the parameters leave out of what is built and evaluated, and why, in words."""
+        """Features that the parameters switch off, and why, in words."""
         return []
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -235,7 +235,7 @@ class FootprintBSDF(mi.BSDF):
         return values
 
     def warn_of_point_footprint(self) -> None:
-        """Say, once, that nothing tells how large a pixel is, and why."""
+        """Warn, once, that the size of a pixel is unknown, and why."""
         if self.warned_of_point_footprint:
             return
         self.warned_of_point_footprint = True
@@ -336,9 +336,9 @@ class GlintBSDF(FootprintBSDF):
         raise NotImplementedError
 
     def finish(self, method: type[PNDF] = PNDF) -> None:
-        """End a subclass's constructor: build, unless somebody else will.
+        """End a subclass's constructor: build, unless ``deferred``.
 
-        ``method``: class of the P-NDF, which tells whether it integrates lights.
+        ``method``: class of the P-NDF, which states whether it integrates lights.
         """
         reflects = all(
             bool(int(c.flags) & int(mi.BSDFFlags.GlossyReflection))
@@ -546,7 +546,7 @@ class GlintBSDF(FootprintBSDF):
         return self.specular_reflectance.eval(si, active)
 
     def mean_tint(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """What tints the surface as seen from afar, where the P-NDF may have colours of its own."""
+        """Mean colour of the surface from afar, including colours of the P-NDF itself."""
         tint = self.tint(si, active)
         if self.pndf is None:
             return tint

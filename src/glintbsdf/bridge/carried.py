@@ -1,19 +1,19 @@
-"""What an integrator tells a glint BSDF besides the footprint: H of the half vector, and the extent
-of a light.
+"""Data that an integrator passes to a glint BSDF besides the footprint: H of the half vector, and
+the extent of a light.
 
 Through Mitsuba's wrappers (``twosided``, ``normalmap``, ``blendbsdf`` …) only the fields of the
 surface interaction reach a BSDF. BSDFs do not use the derivatives of the normal, ``dn_du`` and
-``dn_dv``, and stock integrators leave them at zero. Here they carry, for one evaluation:
+``dn_dv``, and Mitsuba's own integrators leave them at zero. Here they carry, for one evaluation:
 
 * the turn of the half vector, as two vectors w_u and w_v of world space: with e a tangent of the
   shading frame, e·w_u is the change of the half vector's component along e per unit of u, the
-  frame's own turn included. So nested frames find what they need. What w has along the geometric
-  normal plays no part, and is taken out;
+  frame's own turn included. So nested frames find what they need. The component of w along the
+  geometric normal has no effect, and is removed;
 * along the geometric normal, the logarithm of the light's variance, and a mark that all this is
   not the derivative of a normal. The normal is perpendicular to its derivatives, so there is room.
 
-Which BSDFs integrate lights is told by a bit of their flags that Mitsuba does not use. Wrappers
-unite the flags of what they wrap, so the bit shows through them.
+A bit of the flags that Mitsuba does not use marks BSDFs that integrate lights. Wrappers
+unite the flags of the BSDFs inside, so they have the bit, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from glintbsdf.footprint.gaussian import is_literal_zero
 #: The bit of ``BSDFFlags``; those of Mitsuba 3.9 end at bit 16.
 INTEGRATES_LIGHTS = 1 << 30
 
-#: What stands along the normal in ``dn_dv`` where something is carried.
+#: The component along the normal of ``dn_dv`` if the interaction carries data.
 MARK = 1.0
 
 #: A variance (radians²) that counts as none.
@@ -41,7 +41,7 @@ class Carried:
 
     Attributes:
         w_u, w_v (mi.Vector3f): turn of the half vector, world space, per unit of u and of v.
-        variance (mi.Float): of the light's directions about the one that is asked, in every
+        variance (mi.Float): of the light's directions about the evaluated one, in every
             direction across it, radians².
     """
 

@@ -5,7 +5,7 @@ not set, the first one it finds, as soon as it is imported. Versions 14 and 15 a
 make it abort the process at the first kernel ("Cannot select: fminimum"). This module finds the
 newest library of at least :data:`MINIMUM_VERSION` and names it before that happens.
 
-Versions are read off file names, or asked from a separate process: two LLVMs in one process are
+Versions come from file names, or from a separate process: two LLVMs in one process are
 best avoided.
 """
 
@@ -53,9 +53,9 @@ class Library(NamedTuple):
 def choose() -> None:
     """Name the newest usable LLVM to Dr.Jit, unless one is named or loaded already.
 
-    It is called when the package is imported. It does nothing where no usable library is found, as
-    a program that runs on the GPU needs none, or where Dr.Jit was imported before and has made its
-    choice. Then :func:`require_usable` tells those who need one.
+    It is called when the package is imported. It does nothing if there is no usable library, as
+    a program that runs on the GPU needs none, or if Dr.Jit was imported before and has made its
+    choice. Then :func:`require_usable` raises an error where LLVM is needed.
     """
     if VARIABLE in os.environ or "drjit" in sys.modules:
         return

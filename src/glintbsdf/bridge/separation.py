@@ -1,16 +1,16 @@
 """Separated illumination: glints in direct light, a smooth lobe of equal roughness in all other.
 
-Light that has been scattered before arrives from many directions at once, and what glints would
-add to its reflection is noise rather than something to see (Tan et al. 2022, section 4). An
+Light that has been scattered before arrives from many directions at once, so that glints
+would add only noise to its reflection (Tan et al. 2022, section 4). An
 integrator may therefore ask glint BSDFs for their smooth counterpart:
 
     smooth = smooth_context()
     value = bsdf.eval(smooth, si, wo)  # a BSDF of Mitsuba takes it for its ordinary context
 
-The wish is a bit of ``BSDFContext.type_mask`` that none of Mitsuba's ``BSDFFlags`` uses. Mitsuba's
-BSDFs test their own bits only, and ``twosided``, ``normalmap``, ``bumpmap``, ``blendbsdf`` and
-``mask`` hand the context on, so the wish reaches a glint BSDF wherever it is nested. The context is
-known while a kernel is recorded: whoever asks for one lobe gets no code of the other.
+The request is a bit of ``BSDFContext.type_mask`` that none of Mitsuba's ``BSDFFlags`` uses.
+Mitsuba's BSDFs test their own bits only, and ``twosided``, ``normalmap``, ``bumpmap``,
+``blendbsdf`` and ``mask`` pass the context on, so it reaches a glint BSDF wherever it is nested.
+The context is known while a kernel is recorded, so a kernel contains the code of one lobe only.
 """
 
 from __future__ import annotations

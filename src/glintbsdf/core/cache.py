@@ -1,8 +1,8 @@
-"""A cache on disk for what is built from a map: dictionaries of plain NumPy arrays.
+"""A cache on disk for structures that are built from a map: dictionaries of plain NumPy arrays.
 
 The environment variable ``GLINTBSDF_CACHE`` names its directory; ``off`` or an empty value disables
 it. By default it is the user's cache directory (on Linux ``~/.cache/glintbsdf``). The directory may
-be deleted at any time. The least recently used files go when the total passes 4 GiB.
+be deleted at any time. The least recently used files are deleted when the total passes 4 GiB.
 
 Files appear whole or not at all, so processes may share the directory. A file that is cut short or
 damaged is noticed by the checksum of its arrays and replaced. Nothing is ever unpickled.
@@ -44,13 +44,13 @@ def directory() -> Path | None:
 def load_or_build(
     build: Callable[[], Mapping[str, np.ndarray]], *content: object
 ) -> dict[str, np.ndarray]:
-    """Return the arrays that ``build()`` makes of this content, from the cache if it knows them.
+    """Return the arrays that ``build()`` makes from this content, or the cached ones.
 
-    The key is made of ``content``, which must hold all that decides the result: a map's content
-    hash and every parameter, as values whose ``repr`` tells them apart. The name of ``build`` and
-    the source of its module, and of the modules of this package that it imports, are added here: a
-    change of the builder forgets what the former one has made. A cache that cannot be read or
-    written costs one warning and no more; an error in ``build`` is passed on.
+    The key consists of ``content``, which must contain all that determines the result: a map's
+    content hash and every parameter, as values whose ``repr`` tells them apart. The name of
+    ``build`` and the source of its module, and of the modules of this package that it imports, are
+    added here, so a changed builder does not get the results of the former one. A cache that cannot
+    be read or written causes one warning only; an error in ``build`` is passed on.
     """
     folder = directory()
     if folder is None:
@@ -157,9 +157,9 @@ def _load(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def _store(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a file beside its place, then move it there at once.
+    """Write a file under another name in the same folder, then rename it.
 
-    It does not wait for the disk: should the power fail, the checksums reveal what is lost.
+    It does not wait for the disk: after a power failure, the checksums reveal damaged files.
     """
     if any(array.dtype.hasobject for array in arrays.values()):
         raise TypeError("only plain arrays can be cached, not arrays of Python objects")

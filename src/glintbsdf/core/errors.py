@@ -1,6 +1,6 @@
 """The one sentence that reports a wrong parameter.
 
-It names the plugin, the parameter, what is allowed, and what came.
+It names the plugin, the parameter, the allowed values, and the given one.
 """
 
 from __future__ import annotations

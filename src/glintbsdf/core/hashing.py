@@ -52,10 +52,10 @@ def gaussian(bits: mi.UInt32) -> mi.Float:
 
 
 def coherent_vertex(x: mi.Int, y: mi.Int, level: mi.Int) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-    """The name of the vertex (``x``, ``y``) of the grid ``level`` that all grids agree on.
+    """A name of the vertex (``x``, ``y``) of the grid ``level`` that is the same in all grids.
 
-    The spacing of a grid is twice that of the level below, so the vertex (x, y) lies where (2x, 2y)
-    of the level below does. Shifting out the zero bits that both indices end in makes the name
+    The spacing of a grid is twice that of the level below, so the vertex (x, y) is at (2x, 2y)
+    of the level below. Shifting out the zero bits at the end of both indices makes the name
     invariant under doubling (Zirr and Kaplanyan 2016, section 4.1, for both coordinates at once).
     Alone, this also gives (1, 1) and (2, 2) of one grid the same name; the paper blurs such
     recurring patterns by offsets. Here the level to which the indices were shifted, the coarsest

@@ -1,4 +1,4 @@
-"""What the user is told beside errors: through Mitsuba's log, the one channel for all of it.
+"""Warnings and information for the user, all through Mitsuba's log.
 
 Its level is Mitsuba's, ``mi.set_log_level``: warnings show by default, information does not.
 """

@@ -1,8 +1,8 @@
-"""What a scene asks of a normal map: how much of it, and under which footprints.
+"""The part of a normal map that a scene uses, and the sizes of its footprints.
 
-A :class:`Recorder` in a BSDF notes what all queries of a rendering touch; what it has found is a
-:class:`Domain`. P-NDFs that are given one build no more than it needs. A :class:`Gate` in a BSDF
-then sees to it that they are asked for nothing else, and says if anybody has tried.
+A :class:`Recorder` in a BSDF records what all queries of a rendering touch; its result is a
+:class:`Domain`. P-NDFs with a domain build no more than it needs. A :class:`Gate` in a BSDF
+then keeps all queries inside the domain, and reports whether any had to be replaced.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from glintbsdf.maps.normalmap import MapShape
 STEPS = 16
 
 #: Margin that :meth:`Domain.widened` adds: texels on each side, and a factor on sizes. A survey of
-#: some hundred thousand queries stands for a rendering of some millions.
+#: some hundred thousand queries represents a rendering of some millions.
 MARGIN_TEXELS, MARGIN_SIZE = 8, 1.25
 
 
 @dataclass(frozen=True)
 class Domain:
-    """What queries touch of a map.
+    """The part of a map that queries touch.
 
     Attributes:
         columns, rows (tuple[int, int]): first and last texel under any footprint. They are counted
@@ -57,7 +57,7 @@ class Domain:
         return Domain(columns, rows, self.smallest / MARGIN_SIZE, self.largest * MARGIN_SIZE)
 
 
-#: The domain of a map that nobody asks.
+#: The domain of a map without queries.
 NOTHING = Domain(columns=(0, -1), rows=(0, -1), smallest=0.0, largest=0.0)
 
 
@@ -94,7 +94,7 @@ def extent(footprint: Footprint, shape: MapShape) -> Extent:
 
 
 class Recorder:
-    """Notes what queries touch; ``footprint = recorder(footprint, active)`` in a BSDF.
+    """Records what queries touch; ``footprint = recorder(footprint, active)`` in a BSDF.
 
     Args:
         shape (MapShape): shape of the map that is asked.

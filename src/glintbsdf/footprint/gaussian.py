@@ -32,7 +32,7 @@ class Footprint:
         uv: mean, ``mi.Point2f``, UV units.
         du, dv: ``mi.Vector2f``, UV units; the covariance is ``du duᵀ + dv dvᵀ``. Any two vectors
             with this sum describe the same footprint: their order, signs and rotation carry no
-            meaning. Both zero is legal and stands for a point.
+            meaning. Both may be zero: the footprint is then a point.
     """
 
     def __init__(self, uv: mi.Point2f, du: mi.Vector2f, dv: mi.Vector2f) -> None:
@@ -142,7 +142,7 @@ def cone_partials(si: mi.SurfaceInteraction3f, width: mi.Float) -> tuple[mi.Vect
 def project_along(d: mi.Vector3f, n: mi.Vector3f, v: mi.Vector3f) -> mi.Vector3f:
     """``v`` moved along direction ``d`` into the plane through the origin with normal ``n``.
 
-    The sign of ``d`` plays no part. Not finite where ``d`` lies in the plane.
+    The sign of ``d`` does not matter. The result is not finite if ``d`` is in the plane.
     """
     return v - d * (dr.dot(n, v) / dr.dot(n, d))
 

@@ -209,7 +209,7 @@ class TexelKernel:
     def value(self, offset, edge: bool = True):
         """k(Δ) in 1/texel², for ``offset`` Δ = u − x in texels.
 
-        ``edge``: whether the derivative tells of the edge that moves across ``offset``.
+        ``edge``: whether the derivative includes the motion of the kernel's edge across ``offset``.
         """
         if self.kernel == "box":
             u, v = dr.abs(offset.x), dr.abs(offset.y)

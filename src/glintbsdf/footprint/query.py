@@ -62,11 +62,11 @@ class Query:
         return Query(footprint, self.turn, self.spread, self.parameters)
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What ``make()`` returns, made when it is first asked for.
+        """The result of ``make()``, which is called on first use only.
 
-        ``key`` must tell all that ``make`` depends on besides the query. What is returned is shared
-        and must not be changed. Do not call this inside the body of a recorded loop or branch: what
-        is made there does not exist outside.
+        ``key`` must contain all that ``make`` depends on besides the query. The result is shared
+        and must not be changed. Do not call this inside the body of a recorded loop or branch, as
+        results from there do not exist outside.
         """
         if key not in self._derived:
             self._derived[key] = make()

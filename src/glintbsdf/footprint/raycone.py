@@ -1,4 +1,4 @@
-"""Ray cones: how wide the bundle of rays is that a traced ray stands for.
+"""Ray cones: the width of the bundle of rays that a traced ray represents.
 
 A cone is described by two *differentials*, one per image axis: how far the neighbouring pixel's
 ray is away (``dp_x``, ``dp_y``, world units, taken at the ray's origin) and how much its direction
@@ -170,10 +170,10 @@ def curved_interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Su
 
 
 def lobe_width(pdf: mi.Float, sample_count: int) -> mi.Float:
-    """Width in radians of the part of a lobe that one of its samples stands for.
+    """Width in radians of the part of a lobe that one of its samples represents.
 
-    With N samples per pixel, a direction drawn with density ``pdf`` (1/sr) stands for the solid
-    angle 1/(N pdf) (Suykens and Willems 2001), here a square of that side. N enters exactly as in
+    With N samples per pixel, a direction of density ``pdf`` (1/sr) represents the solid
+    angle 1/(N pdf) (Suykens and Willems 2001), here a square of this area. N enters exactly as in
     the 1/√spp of the sensor's differentials, so that all footprints vanish together as N grows.
     """
     return dr.sqrt(dr.minimum(dr.rcp(pdf), MAX_LOBE_SOLID_ANGLE) / sample_count)

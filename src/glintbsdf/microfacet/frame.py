@@ -10,11 +10,12 @@ import mitsuba as mi
 
 
 def above_horizon(active: mi.Bool, *directions: mi.Vector3f) -> tuple:
-    """``(active, *directions)``: active are only lanes whose directions all lie above the horizon.
+    """``(active, *directions)``, active only in lanes whose directions are all above the horizon.
 
-    Elsewhere all of them become the vertical, for which everything is a number: a NaN in a lane
-    that is masked away would still reach its derivatives. The ``bumpmap`` of Mitsuba 3.9 hands over
-    NaN where its relief is level and dp_du the z axis; z need not be among them.
+    In other lanes all directions become the vertical, for which all results are finite: a NaN in a
+    lane that is masked away would still reach its derivatives. The ``bumpmap`` of Mitsuba 3.9
+    passes NaN where its relief is level and dp_du is the z axis; the NaN need not be in the z
+    component.
     """
     active = mi.Bool(active)
     for direction in directions:

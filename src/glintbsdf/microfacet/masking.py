@@ -35,7 +35,7 @@ class SmithMasking:
 
     def smith_lambdas(self, directions: list, query: Query, active: mi.Bool) -> list:
         """As :meth:`smith_lambda` for several directions. A subclass overrides either of the two:
-        this one where directions share what is found under the footprint."""
+        this one if the directions share computations over the footprint."""
         return [self.smith_lambda(w, query, active) for w in directions]
 
     def eval(
@@ -48,7 +48,7 @@ class SmithMasking:
     ) -> mi.Float:
         """The factor G in [0, 1] for two directions of the upper hemisphere.
 
-        ``mode``: what is transported along ``wi``; Smith's factor is the same for both.
+        ``mode``: what ``wi`` transports, light or importance; Smith's factor is the same for both.
         """
         lambda_i, lambda_o = self.smith_lambdas([wi, wo], query, active)
         if self.height_correlated:
@@ -68,7 +68,7 @@ class BeckmannMasking(SmithMasking):
 
     Args:
         alpha_squared: function that returns an ``mi.Vector2f``, squared roughness along u and v. It
-            is asked again when one of ``keys`` has changed.
+            is called again when one of ``keys`` has changed.
         height_correlated: see :class:`SmithMasking`.
         keys: names of the parameters on which the roughness depends.
     """

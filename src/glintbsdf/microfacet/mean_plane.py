@@ -4,7 +4,7 @@ The facets under a footprint have slopes x = m_xy/m_z with the mean s̄. Seen fr
 they cover, per unit of the geometric surface's area,
 
     P(ω) = mean of max(ω_z + x·ω_xy, 0)        all facets that face ω, each by itself
-    P̄(ω) = max(ω_z + s̄·ω_xy, 0)               the plane of slope s̄, which is what is seen of them
+    P̄(ω) = max(ω_z + s̄·ω_xy, 0)               the plane of slope s̄, the visible area of all facets
 
 and P ≥ P̄, by the convexity of max. Smith's masking is their quotient, G1 = P̄/P: the share of the
 facing facets that no other one hides. Its usual form has ω_z for P̄, the geometric surface. That is
@@ -16,10 +16,10 @@ With D(m) the distribution of normals and F the reflectance of a facet,
     f_r cosθ_o = F D V/4,        V = G/P̄(ω_i)
 
 and no more is reflected than is received, as ∫ D max(m·ω_i, 0) dω_m = P(ω_i) and V ≤ 1/P(ω_i). V
-has a limit where the plane is seen edge on from ω_i, and keeps it where it turns away, since facets
-of the patch may be seen still.
+has a limit where ω_i sees the plane edge on, and keeps it where the plane turns away, since facets
+of the patch may still be visible.
 
-The rule is not reciprocal: what a pixel sees is the mean over the patch as seen from ω_i. Where
+The rule is not reciprocal: a pixel sees the mean over the patch, as projected along ω_i. Where
 importance is transported, the two directions have changed their roles.
 
 Sources: Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 2014;

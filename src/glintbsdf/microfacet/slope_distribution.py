@@ -157,8 +157,8 @@ class SlopeLobe:
         """A unit normal with density ``max(0, w·m) D(m) / P(w)`` per solid angle."""
         if self.distribution == "ggx":
             return self.sample_visible_ggx(w, sample2)
-        # Along the direction e of w the slope is weighed by t; across it, given the slope along e,
-        # it is a Gaussian of its own.
+        # Along the direction e of w the slope is weighted by t; across it, given the slope along e,
+        # its distribution is a Gaussian.
         plane = mi.Vector2f(w.x, w.y)
         length = dr.norm(plane)
         tilted = length > 0

@@ -47,7 +47,7 @@ class SlopeFrame:
     def __init__(self, matrix: mi.Matrix2f) -> None:
         self.matrix = matrix
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
-        # The determinant is 1 or −1 but for rounding.
+        # The determinant is 1 or −1, except for rounding.
         self.inverse = mi.Matrix2f(
             [[matrix[1, 1], -matrix[0, 1]], [-matrix[1, 0], matrix[0, 0]]]
         ) * dr.sign(determinant)
@@ -80,7 +80,7 @@ class SlopeFrame:
             place = mi.AffineTransform3f(to_uv) @ si.uv
             w = w * _parity(place.x)
             h = h * _parity(place.y)
-        # J⁻¹ but for the factor 1/det J, whose amount the normalisation takes out.
+        # J⁻¹ without the factor 1/det J, whose magnitude the normalisation removes.
         # Rows of Jᵀ's adjugate: (∂u/∂s, ∂u/∂t) and (∂v/∂s, ∂v/∂t).
         sign = dr.sign(sine)
         u_s, u_t = j_tv * sign, -j_sv * sign

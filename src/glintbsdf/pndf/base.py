@@ -84,10 +84,10 @@ class PNDF(ABC):
     # ----------------------------------------------------------------------------------------------
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make what queries within ``domain`` need, or any query; what was built before goes.
+        """Build the structures for queries within ``domain``, or for any; they replace former ones.
 
-        Within the domain, the answers are to the last bit those of a complete structure. A method
-        may build for more than it is asked to, never for less. By default there is no structure.
+        Within the domain, results equal those of a complete structure to the last bit. A method
+        may build for a larger domain, never for a smaller one. By default there is no structure.
         """
         self.domain = domain
 
@@ -103,8 +103,8 @@ class PNDF(ABC):
         return load_or_build(build, *content, *parameters)
 
     def prepare_for_lights(self) -> None:
-        """Make what queries with a spread need, where that is not there yet. Nothing can be made
-        while a kernel is recorded, so whoever will ask such queries calls this before."""
+        """Build the structures for queries with a spread, unless they exist. Nothing can be built
+        while a kernel is recorded, so this has to be called before such queries."""
 
     #: Whether parameters have been changed since the construction.
     changed: bool = False
@@ -119,7 +119,7 @@ class PNDF(ABC):
         return sum(self.parts().values())
 
     def left_out(self) -> list[str]:
-        """What the parameters leave out of what is built and evaluated, and why, in words."""
+        """Features that the parameters switch off, and why, in words."""
         return []
 
     # ----------------------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def fit_clusters(
     ``epsilon`` is the smallest |det J|. Yields, for every level, arrays over its ⌊R/2^l⌋ × ⌊C/2^l⌋
     whole clusters: the normals n_0^l…n_3^l, (…, 4, 2), and the residuals e^l.
 
-    Eq. 8 prints the residual of the solved normal equations, which is 0 but for rounding. The
+    Eq. 8 prints the residual of the solved normal equations, which is 0 except for rounding. The
     residual that is returned is the minimum of the integral in Eq. 7, in texels⁴. Its integrand
     ‖n^l − n‖²/|det J| is, to first order, the squared distance (texels²) between the positions at
     which the cluster and the map show the same normal.
