@@ -72,16 +72,16 @@ class FootprintBSDF(mi.BSDF):
     """A BSDF that depends on the footprint: its parameters, and what follows from them.
 
     A subclass's constructor reads its parameters, then calls :meth:`build` unless it is
-    ``deferred``: whoever loads the scene then builds it, for the domain that the scene asks for.
+    ``deferred``: the loader of the scene then calls it, with the domain that the scene needs.
 
     Attributes:
-        owner, name (str): type and id of the plugin, as errors and warnings name them.
+        owner, name (str): type and id of the plugin, for errors and warnings.
         deferred (bool): whether the constructor is to build nothing. The property of this name is
             set by :func:`glintbsdf.scene.rendering.load_scene`, not by users.
         to_uv (mi.ScalarAffineTransform3f): transform of UV space.
         footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
         normal_map (NormalMap): the map as it was loaded, None without one.
-        watch (Recorder | Gate): looks at every footprint; None by default.
+        watch (Recorder | Gate): gets every footprint; None by default.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
     """
@@ -113,7 +113,7 @@ class FootprintBSDF(mi.BSDF):
         return None if self.normal_map is None else self.normal_map.shape
 
     def build(self, domain: Domain | None = None) -> None:
-        """Make what queries within ``domain`` need, or any query; what was built before goes."""
+        """Build structures for queries within ``domain``, or for any; they replace former ones."""
         raise NotImplementedError
 
     def parts(self) -> dict[str, int]:
@@ -147,8 +147,8 @@ class FootprintBSDF(mi.BSDF):
                 value,
             )
 
-    # A value and its density take one and the same query, in ``eval_pdf``. What a caller does not
-    # use, Dr.Jit leaves out of the kernel.
+    # A value and its density share one query, in ``eval_pdf``. Dr.Jit removes results that a caller
+    # does not use from the kernel.
     def eval(
         self,
         ctx: mi.BSDFContext,
@@ -179,7 +179,7 @@ class FootprintBSDF(mi.BSDF):
         return footprint if self.watch is None else self.watch(footprint, mi.Bool(active))
 
     def look_at_surfaces(self) -> None:
-        """Look, once, whether the shapes that this BSDF is on fit its map.
+        """Check, once, whether the shapes with this BSDF fit its map.
 
         Raises:
             ParameterError: a mesh without UV coordinates.
@@ -194,8 +194,8 @@ class FootprintBSDF(mi.BSDF):
             warn(f'{self.owner} "{self.name}": {doubt}')
 
     def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:
-        """How slopes of a height map lie on the surface at ``si``; None for a map of normals, which
-        are read in the shading frame as Mitsuba's ``normalmap`` reads them."""
+        """The frame of a height map's slopes on the surface at ``si``; None for a map of normals,
+        which are relative to the shading frame, as in Mitsuba's ``normalmap``."""
         shape = self.map_shape
         if shape is None or self.normal_map is None or not self.normal_map.is_height:
             return None
@@ -209,11 +209,11 @@ class FootprintBSDF(mi.BSDF):
         wi: mi.Vector3f | None = None,
         wo: mi.Vector3f | None = None,
     ) -> Query:
-        """All that an evaluation at ``si`` asks of the P-NDF; made once for each.
+        """The query of an evaluation at ``si``; each evaluation makes one.
 
-        ``wi``, ``wo``: local directions between which a facet mirrors; None for any. Where they are
-        given, what ``si`` carries of the half vector's turn and of a light's extent is a part of
-        the query.
+        ``wi``, ``wo``: local directions between which a facet reflects; None for any. If they are
+        given, the query includes the half vector's turn and the light's extent that ``si`` carries,
+        if any.
         """
         self.traverse(RefusesDerivatives(self.owner))
         footprint, parameters = self.footprint(si, active), self.parameters_at(si, mi.Bool(active))
@@ -275,12 +275,12 @@ class FootprintBSDF(mi.BSDF):
 
 
 class Facets(NamedTuple):
-    """What reflects at a surface interaction.
+    """The facets at a surface interaction.
 
     Attributes:
         pndf (PNDF): the distribution of their normals.
-        masking (SmithMasking): how they hide each other; None for not at all.
-        tint (mi.UnpolarizedSpectrum): factor on what they reflect.
+        masking (SmithMasking): their masking and shadowing; None for none.
+        tint (mi.UnpolarizedSpectrum): factor on the reflected light.
     """
 
     pndf: PNDF
@@ -293,16 +293,16 @@ class GlintBSDF(FootprintBSDF):
 
     The base class reads the parameters that all glint BSDFs share and implements Mitsuba's
     interface once. A subclass reads its own parameters in its constructor, which ends with
-    :meth:`finish`, and says in :meth:`create` how its P-NDF is made.
+    :meth:`finish`, and makes its P-NDF in :meth:`create`.
 
     Attributes:
-        pndf (PNDF): the P-NDF. None as long as nothing is built: a smooth surface of the map's
+        pndf (PNDF): the P-NDF. None before it is built: a smooth surface of the map's
             overall roughness then takes its place.
         masking (SmithMasking): masking of the P-NDF's facets; None for none.
-        smooth (PNDF): what all glints add up to, which takes their place in a
+        smooth (PNDF): the mean of all glints, which replaces them in a
             ``separation.smooth_context()``; None where the P-NDF is smooth by itself.
         smooth_masking (SmithMasking): masking of the facets of ``smooth``.
-        interface (Interface): what happens at a facet.
+        interface (Interface): the optical interface of a facet.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
     """

@@ -1,15 +1,14 @@
-"""A query: everything that one evaluation of a glint BSDF asks of its P-NDF.
+"""A query: all inputs of a P-NDF, except the normal, in one evaluation of a glint BSDF.
 
-The BSDF's base class makes one query per evaluation and hands it to the density, the sampler, the
-masking and whatever stands between them. All of them share what it carries, and what any of them
-derives from it.
+The BSDF's base class makes one query per evaluation and passes it to the density, the sampler and
+the masking. All of them share its data, and quantities that they derive from it.
 
-**The footprint** says where on the map we look, and how far around.
+**The footprint** is the part of the map under the pixel.
 
 **The turn** H of the half vector. Over a footprint the half vector is not constant: the surface is
-curved, the camera and the light are near. To first order its projection is s(u) = s₀ + H (u − u₀).
-What is wanted is then ``∫ k(u) δ(n(u) − s(u)) du``, the P-NDF of the field n(u) − H (u − u₀): every
-Jacobian J of the map becomes J − H.
+curved, and the camera and the light are near. To first order its projection is
+s(u) = s₀ + H (u − u₀). The P-NDF is then ``∫ k(u) δ(n(u) − s(u)) du``, that of the field
+n(u) − H (u − u₀): every Jacobian J of the map becomes J − H.
 
 **The spread** Σ in normal space. Under a light of some extent the half vector covers a region
 around s₀. The P-NDF is averaged over a Gaussian of this covariance.
@@ -29,16 +28,16 @@ T = TypeVar("T")
 
 
 class Query:
-    """One question to a P-NDF.
+    """All inputs of a P-NDF except the normal.
 
     Args:
         footprint (Footprint): mean and axes in the UV space of the map.
-        turn (mi.Matrix2f): H = ∂s/∂u of the half vector's projection, per unit of UV; None where
-            the half vector counts as constant.
+        turn (mi.Matrix2f): H = ∂s/∂u of the half vector's projection, per unit of UV; None if
+            the half vector is constant.
         spread: vectors v (``mi.Vector2f``) whose products v vᵀ add up to the covariance Σ of
             projected normals over which D is averaged; none for no average.
-        parameters: values at the surface point, by name, of the P-NDF's parameters that have a
-            texture.
+        parameters: values, by name, of the P-NDF's parameters that have a
+            texture, at the surface point.
     """
 
     def __init__(

@@ -128,10 +128,10 @@ class Reflection(Component):
 
 
 class Interface(ABC):
-    """What a facet is made of.
+    """The optical interface of a facet.
 
     Attributes:
-        components (tuple[Component, ...]): the ways that light takes. No two of them lead to the
+        components (tuple[Component, ...]): for example reflection. No two of them lead to the
             same direction.
     """
 

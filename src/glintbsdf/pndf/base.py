@@ -1,10 +1,10 @@
-"""The contract of P-NDFs, and the register of all of them.
+"""The interface of P-NDFs, their contract, and the register of all of them.
 
-A P-NDF D(m) is the distribution of the normals that a footprint sees, a density over the disk of
-projected normals: ``∫ D(m) dm = 1``. One object is the density, its sampler, and the projected area
-of its facets, from which masking follows.
+A P-NDF D(m) is the distribution of the normals under a footprint, a density over the disk of
+projected normals: ``∫ D(m) dm = 1``. One object has the density, its sampler, and the projected
+area of its facets, from which masking follows.
 
-A new method is a class that derives from :class:`PNDF`, says what the abstract methods ask for, and
+A new method is a class that derives from :class:`PNDF`, implements the abstract methods, and
 enters the register::
 
     @register("my_method", title="My method")
@@ -12,7 +12,7 @@ enters the register::
         ...
 
 Tests, benchmarks and the report take their methods from the register. The page "Write your own
-P-NDF" tells how to write one.
+P-NDF" shows how to write one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from glintbsdf.microfacet.masking import BeckmannMasking, MeanPlaneMasking, Smit
 
 
 class Colors(Protocol):
-    """Colours of facets: all that the contract asks of them is their mean, linear RGB."""
+    """Colours of facets. The contract requires only their mean, linear RGB."""
 
     mean: tuple[float, ...]
 
@@ -46,11 +46,11 @@ class PNDF(ABC):
 
     It belongs to the variant of Mitsuba that is active when it is made.
 
-    A subclass implements :meth:`_eval` and :meth:`_sample`, and overrides what differs from the
-    defaults here. Callers use :meth:`eval`, :meth:`sample` and the methods after them.
+    A subclass implements :meth:`_eval` and :meth:`_sample`, and overrides methods that differ from
+    the defaults here. Callers use :meth:`eval`, :meth:`sample` and the methods after them.
 
     Attributes:
-        owner (str): the name that errors give, usually the plugin's.
+        owner (str): name in error messages, usually the plugin's.
         normal_map (NormalMap): the map; None for a P-NDF without one.
         domain (Domain): the queries that the structure is built for; None for any query.
         intensity (mi.Float): factor on the reflection; None for 1.
@@ -65,11 +65,11 @@ class PNDF(ABC):
     #: The maskings that :meth:`masking` can make, the default one first.
     maskings: ClassVar[tuple[str, ...]] = ("beckmann", "none")
 
-    #: Whether D is averaged over the ``spread`` of a query, and its half vector turns: lights of
-    #: some extent are then integrated by the P-NDF.
+    #: Whether D uses the ``spread`` and the ``turn`` of a query: the P-NDF then integrates lights
+    #: of some extent.
     integrates_lights: ClassVar[bool] = False
 
-    #: Parameters on which the roughness of the whole depends.
+    #: Parameters on which the roughness of the whole surface depends.
     roughness_keys: ClassVar[tuple[str, ...]] = ("data", "sigma_r")
 
     owner: str = "PNDF"
@@ -155,13 +155,13 @@ class PNDF(ABC):
 
     @abstractmethod
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float | mi.Color3f:
-        """What :meth:`eval` returns."""
+        """Implementation of :meth:`eval`."""
 
     @abstractmethod
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
-        """What :meth:`sample` returns."""
+        """Implementation of :meth:`sample`."""
 
     def sample_visible(
         self,
@@ -212,7 +212,7 @@ class PNDF(ABC):
         return map_alpha_squared(self.data)
 
     def smooth(self) -> PNDF | None:
-        """The smooth P-NDF that all glints add up to from afar; None where D is smooth itself."""
+        """The smooth P-NDF of very large footprints; None if D is smooth itself."""
         return None
 
     def masking(self, name: str, height_correlated: bool = True) -> SmithMasking | None:
@@ -238,14 +238,15 @@ class PNDF(ABC):
         raise NotImplementedError(f"{type(self).__name__} knows no projected areas")
 
     # ----------------------------------------------------------------------------------------------
-    #  As a part of a scene
+    #  Parameters
     # ----------------------------------------------------------------------------------------------
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show the parameters to ``callback``."""
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check the parameters named, or all where none is named; rebuild what they decide."""
+        """Check the parameters ``keys``, or all if empty, and rebuild structures that depend on
+        them."""
 
 
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:
@@ -268,7 +269,7 @@ class Method:
 
     Attributes:
         name (str): its name, lower case.
-        title (str): what reports call it.
+        title (str): its name in reports.
         pndf (type): the class.
         takes_map (bool): whether the class takes a :class:`~glintbsdf.NormalMap` first.
         plugin (str): type of the plugin that wraps it.
@@ -285,7 +286,7 @@ class Method:
     settings: Mapping[str, object] = field(default_factory=dict)
 
     def create(self, normal_map: NormalMap | None = None, **options: object) -> PNDF:
-        """Make the P-NDF, of ``normal_map`` if it takes one; ``options`` overrule its own."""
+        """Make the P-NDF, with ``normal_map`` if it takes one; ``options`` override its own."""
         arguments = (normal_map,) if self.takes_map else ()
         return self.pndf(*arguments, **{**self.options, **options})  # type: ignore[call-arg]
 
