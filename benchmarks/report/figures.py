@@ -9,9 +9,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from benchmarks.report import pareto
+from glintbsdf.check.plot import label_logarithmic
 
 #: Okabe and Ito's colours, which the colour-blind can distinguish, and markers, one per family.
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#000000", "#999999")
@@ -53,16 +53,6 @@ def draw(folder: Path, name: str, plot, *arguments) -> str:
     """A figure by one of the functions below, saved."""
     with matplotlib.rc_context(STYLE):
         return save(plot(name, *arguments), folder, name)
-
-
-def logarithmic(*axes) -> None:
-    """Label logarithmic axes (``axis.xaxis``) at 1, 2, 5, or at decades if there are many."""
-    for axis in axes:
-        low, high = axis.get_view_interval()
-        subdivided = high < 300 * low
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if subdivided else (1,)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
 
 
 def panels(count: int, width: float = 3.1, height: float = 2.7, most: int = 5):
@@ -130,7 +120,7 @@ def errors(name: str, units: list[dict], palette: Palette, metric: str, cost: st
                 )
                 seen.setdefault(family, mark)
         axis.set(xscale="log", yscale="log", title=f"r = {unit['radius']:g} texels")
-        logarithmic(axis.xaxis, axis.yaxis)
+        label_logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel(label)
     axes[0].set_ylabel(METRICS[metric])
     solid = {
@@ -160,7 +150,7 @@ def cost(name: str, units_of_maps: dict[str, list[dict]], palette: Palette) -> F
             )
             lines.setdefault(family, line)
         axis.set(xscale="log", yscale="log", title=title)
-        logarithmic(axis.xaxis, axis.yaxis)
+        label_logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel("radius r of the footprint (texels)")
     axes[0].set_ylabel("time per query (µs)")
     legend_below(figure, lines, min(len(axes), 3))
@@ -185,7 +175,7 @@ def images(name: str, points: list[dict], noise: float, names: list[str]) -> Fig
     for axis, label in zip(axes, ("seconds of rendering", "samples per pixel"), strict=True):
         axis.axhline(noise, linestyle="--", color="#777777", linewidth=0.9)
         axis.set(xscale="log", yscale="log", xlabel=label)
-        logarithmic(axis.xaxis, axis.yaxis)
+        label_logarithmic(axis.xaxis, axis.yaxis)
     axes[0].set_ylabel("relative RMSE")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper")
     return figure

@@ -7,10 +7,9 @@ import io
 from pathlib import Path
 
 import jinja2
+import matplotlib
 import numpy as np
 from PIL import Image
-
-from glintbsdf.check.plot import colour_map
 
 #: Brightness is this power of density: a few peaks would leave all else black.
 _GAMMA = 0.5
@@ -44,7 +43,8 @@ def html(report: dict, drawn: dict[str, str], thumbnails: dict[str, str], pictur
 
 def density_uri(density: np.ndarray, peak: float) -> str:
     """A P-NDF, y upwards, in false colours; ``peak`` is white."""
-    return data_uri(colour_map(np.clip(density[::-1] / peak, 0, 1) ** _GAMMA))
+    colours = matplotlib.colormaps["inferno"](np.clip(density[::-1] / peak, 0, 1) ** _GAMMA)
+    return webp(colours[..., :3])
 
 
 def white_of(image: np.ndarray) -> float:
@@ -59,7 +59,11 @@ def image_uri(image: np.ndarray, white: float) -> str:
 
 def data_uri(linear: np.ndarray) -> str:
     """An H×W×3 image of linear RGB in [0, 1], as WebP within a ``data:`` address."""
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return webp(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
+
+
+def webp(encoded: np.ndarray) -> str:
+    """An H×W×3 image of sRGB in [0, 1], as WebP within a ``data:`` address."""
     buffer = io.BytesIO()
     Image.fromarray(np.uint8(np.rint(255 * encoded))).save(buffer, "WEBP", quality=85)
     return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()

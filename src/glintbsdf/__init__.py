@@ -20,7 +20,7 @@ from glintbsdf.bridge import registration as _registration  # noqa: E402
 _registration.install()
 
 if TYPE_CHECKING:
-    from glintbsdf import maps, pndf, reference
+    from glintbsdf import maps, plot, pndf, reference
     from glintbsdf.core.errors import ParameterError
     from glintbsdf.footprint.gaussian import Footprint
     from glintbsdf.maps.normalmap import NormalMap
@@ -34,6 +34,7 @@ __all__ = [
     "ParameterError",
     "maps",
     "pixel_spread",
+    "plot",
     "pndf",
     "reference",
 ]

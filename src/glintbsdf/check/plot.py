@@ -1,160 +1,158 @@
-"""A drawing of a plugin's P-NDF beside the binned reference, with the error and the time."""
+"""Figures: a P-NDF beside its reference, a footprint on its map, error over time.
+
+Every function returns a matplotlib figure, which a notebook shows and ``figure.savefig`` writes.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from glintbsdf.check.reference import BinnedPNDF, binned_pndf, texel_covariance
-from glintbsdf.core.errors import check
+from glintbsdf.check.comparison import Comparison
 from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.maps.normalmap import NormalMap
 
-# Points per bin and axis at which the density is evaluated: the reference is the mean over a bin.
-_SUBSAMPLES = 4
-
-# Brightness is this power of the density: otherwise a few peaks would leave everything else black.
+#: Colours are spread by this power of the density. Without it, a few peaks leave all else black.
 _GAMMA = 0.5
 
+#: Largest distance, in pixels, from the centre of a drawing of a footprint to its border.
+_MAX_REACH = 500
 
-@dataclass(frozen=True)
-class Comparison:
-    """A P-NDF in the bins of its reference.
 
-    Attributes:
-        density: mean of D over random points of each bin, res x res, rows from low to high y.
-        standard_error: standard error of these means.
-        reference: the binned reference.
-        queries: number of evaluations of the density.
-        seconds: their time, without the compilation.
+def pndf(comparison: Comparison) -> Figure:
+    """Draw a P-NDF beside its reference on one scale, and the footprint on the map if there is one.
+
+    The axes are the projected normal's x and y; the second scales are its inclination along them,
+    in degrees.
     """
-
-    density: np.ndarray
-    standard_error: np.ndarray
-    reference: BinnedPNDF
-    queries: int
-    seconds: float
-
-    def __str__(self) -> str:
-        return (
-            f"relative L1 difference {self.reference.relative_l1(self.density):.2%}, "
-            f"where noise alone makes {self.noise:.2%}\n"
-            f"{self.queries} queries in {self.seconds:.3g} s ({self.queries / self.seconds:.3g}/s)"
+    has_map = comparison.normal_map is not None
+    figure = Figure(figsize=(13 if has_map else 8.8, 4.4), layout="constrained")
+    axes = figure.subplots(1, 3 if has_map else 2)
+    reference = comparison.reference
+    peak = max(comparison.density.max(), reference.density.max())
+    (left, bottom), (right, top) = reference.bounds
+    named = {
+        comparison.title: comparison.density,
+        "reference" if has_map else "samples": reference.density,
+    }
+    for axis, (title, density) in zip(axes, named.items(), strict=False):
+        shown = axis.imshow(
+            density,
+            extent=(left, right, bottom, top),
+            origin="lower",
+            norm=PowerNorm(_GAMMA, 0, peak if peak > 0 else 1),
+            cmap="inferno",
+            aspect="equal" if 0.2 < (right - left) / (top - bottom) < 5 else "auto",
         )
-
-    @property
-    def noise(self) -> float:
-        """The expected relative L1 difference of an exact density, from the noise of both grids.
-
-        The mean of |x| is √(2/π) times the standard deviation, for a Gaussian. Bins without a
-        sample of the reference have no noise of the reference.
-        """
-        reference = np.where(self.reference.density > 0, self.reference.standard_error, 0)
-        deviation = np.hypot(self.standard_error, reference)
-        return float(np.sqrt(2 / np.pi) * deviation.sum() / self.reference.density.sum())
-
-    def drawing(self) -> mi.Bitmap:
-        """Draw density and reference side by side on one scale, y upwards."""
-        gap = np.ones((len(self.density), 8, 3))
-        peak = max(self.density.max(), self.reference.density.max())
-        left, right = (
-            colour_map((values / peak)[::-1] ** _GAMMA)
-            for values in (self.density, self.reference.density)
-        )
-        return mi.Bitmap(np.concatenate([left, gap, right], axis=1).astype(np.float32))
+        axis.set(title=title, xlabel="normal x", ylabel="normal y")
+        degrees = (_inclination, _projection)
+        axis.secondary_xaxis("top", functions=degrees).set_xlabel("degrees")
+        axis.secondary_yaxis("right", functions=degrees)
+    figure.colorbar(shown, ax=list(axes[:2]), label="density over the disk", shrink=0.8)
+    if has_map:
+        draw_footprint(axes[2], comparison.normal_map, comparison.footprint)
+    return figure
 
 
-def compare(
-    plugin: str,
-    map_file: Path,
-    uv: tuple[float, float],
-    sigma: float,
-    res: int,
-    parameters: Mapping[str, str],
-    samples_per_bin: int = 200,
-) -> Comparison:
-    """Evaluate the P-NDF of a plugin under a round footprint, and its reference.
+def _inclination(projected: np.ndarray) -> np.ndarray:
+    """The angle in degrees whose sine is a coordinate of the projected normal."""
+    return np.degrees(np.arcsin(np.clip(projected, -1, 1)))
+
+
+def _projection(degrees: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`_inclination`."""
+    return np.sin(np.radians(np.clip(degrees, -90, 90)))
+
+
+def footprint(normal_map: NormalMap, seen: Footprint) -> Figure:
+    """Draw a footprint on the texels around it; see :func:`draw_footprint`."""
+    figure = Figure(figsize=(4.4, 4.4), layout="constrained")
+    draw_footprint(figure.subplots(), normal_map, seen)
+    return figure
+
+
+def draw_footprint(axis: Axes, normal_map: NormalMap, seen: Footprint) -> None:
+    """Draw a footprint on the texels around it, with ellipses at one and three standard deviations.
+
+    Texels have the colours of a normal map: red for x, green for y. The axes count texels from the
+    centre of texel 0.
 
     Args:
-        plugin: type of a glint BSDF.
-        map_file: its map.
-        uv: centre of the footprint in UV.
-        sigma: standard deviation of the footprint in texels.
-        res: bins along each axis, over the range of the map's normals.
-        parameters: further parameters of the plugin, as strings.
-        samples_per_bin: mean number of samples of the reference in a bin.
-
-    Raises:
-        ParameterError: the plugin has no P-NDF to draw.
+        axis: axes of matplotlib.
+        normal_map: the map.
+        seen: a single footprint in UV.
     """
-    bsdf = mi.load_dict({"type": plugin, "filename": str(map_file), **_typed(parameters)})
-    pndf = bsdf.pndf if hasattr(bsdf, "pndf") else bsdf
-    check(hasattr(pndf, "normal_map"), "pndf", "type", "a glint BSDF with a normal map", plugin)
-    normal_map = pndf.normal_map
-
-    reference = binned_pndf(
-        normal_map,
-        uv,
-        texel_covariance(normal_map, sigma),
-        kernel=pndf.kernel,
-        epsilon=pndf.epsilon,
-        sigma_r=pndf.sigma_r[0] if hasattr(pndf, "sigma_r") else 0.0,
-        res=res,
-        samples=samples_per_bin * res * res,
+    size = np.array([normal_map.width, normal_map.height])
+    centre = np.array(seen.uv, np.float64).ravel() * size - 0.5
+    axes = np.stack([np.array(v, np.float64).ravel() * size for v in (seen.du, seen.dv)], axis=1)
+    directions, deviations, _ = np.linalg.svd(axes)
+    reach = max(4 * deviations[0], 3.0)
+    step = int(np.ceil(reach / _MAX_REACH))  # texels of a large footprint that are one pixel
+    column, row = (
+        np.arange(np.floor(c - reach), np.ceil(c + reach) + 1, step).astype(int) for c in centre
     )
-
-    footprint = Footprint(
-        mi.Point2f(uv),
-        mi.Vector2f(sigma / normal_map.width, 0),
-        mi.Vector2f(0, sigma / normal_map.height),
+    rows = _wrapped(row, normal_map.height, normal_map.wrap_mode)
+    columns = _wrapped(column, normal_map.width, normal_map.wrap_mode)
+    s = normal_map.normals[np.ix_(rows, columns)]
+    z = np.sqrt(np.maximum(1 - (s**2).sum(axis=2, keepdims=True), 0))
+    axis.imshow(
+        0.5 + 0.5 * np.concatenate([s, z], axis=2),
+        extent=(column[0] - step / 2, column[-1] + step / 2, row[-1] + step / 2, row[0] - step / 2),
     )
-    (x_min, y_min), (x_max, y_max) = reference.bounds
-    count = res * _SUBSAMPLES
-    jitter = np.random.default_rng(0).random((2, count, count))
-    row, column = (np.indices((count, count)) + jitter) / count
-    x, y = x_min + (x_max - x_min) * column, y_min + (y_max - y_min) * row
-    m = mi.Vector2f(mi.Float(x.ravel()), mi.Float(y.ravel()))
-    dr.eval(m)
-
-    few = dr.gather(mi.Vector2f, m, dr.arange(mi.UInt32, 16))
-    dr.eval(few)
-    pndf.eval(few, footprint).numpy()  # compiles the kernel
-    start = time.perf_counter()
-    density = pndf.eval(m, footprint).numpy()
-    seconds = time.perf_counter() - start
-
-    points = density.reshape(res, _SUBSAMPLES, res, _SUBSAMPLES)
-    mean = points.mean(axis=(1, 3), dtype=np.float64)
-    # An upper bound: stratified points have less noise.
-    standard_error = points.std(axis=(1, 3), dtype=np.float64, ddof=1) / _SUBSAMPLES
-    return Comparison(mean, standard_error, reference, count * count, seconds)
+    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
+    for factor, style in ((1, "-"), (3, ":")):
+        across, along = 2 * factor * deviations[0], 2 * factor * deviations[1]
+        axis.add_patch(
+            Ellipse(centre, across, along, angle=angle, fill=False, color="black", linestyle=style)
+        )
+    axis.set(title="footprint on the map: 1 σ, 3 σ", xlabel="texels", ylabel="texels")
 
 
-def colour_map(value: np.ndarray) -> np.ndarray:
-    """Map [0, 1] to linear RGB: from black through blue and orange to white, ever brighter."""
-    stops = np.linspace(0, 1, 5)
-    colours = np.array(
-        [[0, 0, 0], [0.05, 0.05, 0.35], [0.55, 0.1, 0.25], [1, 0.5, 0.05], [1, 1, 0.85]]
-    )
-    return np.stack([np.interp(value, stops, channel) for channel in colours.T], axis=-1)
+def _wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
+    """Texels of a map for indices outside of it."""
+    if wrap_mode == "clamp":
+        return np.clip(index, 0, count - 1)
+    if wrap_mode == "mirror":
+        index = index % (2 * count)
+        return np.minimum(index, 2 * count - 1 - index)
+    return index % count
 
 
-def _typed(parameters: Mapping[str, str]) -> dict[str, bool | int | float | str]:
-    """Convert strings to the types that their spelling suggests, as Mitsuba's dictionaries need."""
+def errors(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    noise: float | None = None,
+    cost: str = "seconds",
+) -> Figure:
+    """Draw errors over their cost, both logarithmic, a line for each name.
 
-    def typed(text: str) -> bool | int | float | str:
-        if text in ("true", "false"):
-            return text == "true"
-        for number in (int, float):
-            try:
-                return number(text)
-            except ValueError:
-                continue
-        return text
+    Args:
+        curves: for each name, costs and errors, positive.
+        noise: the error of the reference, below which nothing can be measured; a dashed line.
+        cost: what the costs are, with their unit.
+    """
+    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    axis = figure.subplots()
+    for name, (costs, values) in curves.items():
+        axis.plot(costs, values, "o-", markersize=4, linewidth=1, label=name)
+    if noise is not None:
+        axis.axhline(noise, linestyle="--", color="#777777", linewidth=0.9)
+    axis.set(xscale="log", yscale="log", xlabel=cost, ylabel="error")
+    label_logarithmic(axis.xaxis, axis.yaxis)
+    axis.legend(frameon=False)
+    return figure
 
-    return {key: typed(text) for key, text in parameters.items()}
+
+def label_logarithmic(*axes) -> None:
+    """Label logarithmic axes (``axis.xaxis``) at 1, 2, 5, or at decades if there are many."""
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        subdivided = high < 300 * low
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if subdivided else (1,)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())

@@ -18,7 +18,6 @@ import mitsuba as mi
 
 from glintbsdf import __version__
 from glintbsdf.bridge import llvm
-from glintbsdf.check import plot as pndf_plot
 from glintbsdf.cli.doctor import examine
 from glintbsdf.cli.render_options import (
     ImageRequest,
@@ -117,6 +116,13 @@ def _parse_exr(_context: click.Context, _parameter: click.Parameter, path: Path)
     """Refuse names that are not names of OpenEXR files."""
     if path.suffix.lower() != ".exr":
         raise click.BadParameter(f'must end in .exr (got "{path}")')
+    return path
+
+
+def _parse_figure(_context: click.Context, _parameter: click.Parameter, path: Path) -> Path:
+    """Refuse names of files that are neither figures nor archives of numbers."""
+    if path.suffix.lower() not in (".png", ".pdf", ".svg", ".npz"):
+        raise click.BadParameter(f'must end in .png, .pdf, .svg or .npz (got "{path}")')
     return path
 
 
@@ -353,28 +359,35 @@ def example(name: str | None, folder: Path | None) -> None:
 
 @commands.command()
 @click.option("--type", "plugin", required=True, metavar="TYPE", help="Type of the glint BSDF.")
-@click.option("--map", "map_file", type=_file, required=True, help="Normal or height map.")
+@click.option("--map", "map_file", type=_file, help="Normal or height map, where TYPE takes one.")
 @click.option("--uv", type=(float, float), required=True, help="Centre of the footprint.")
 @click.option(
     "--sigma",
     type=click.FloatRange(min=0),
     required=True,
-    metavar="TEXELS",
-    help="Standard deviation of the footprint in texels.",
+    help="Standard deviation of the footprint in texels of the map; in UV without a map.",
 )
 @click.option(
     "--res",
     type=click.IntRange(2, 4096),
     default=256,
     show_default=True,
-    help="Pixels of a drawing along each axis.",
+    help="Bins of normals along each axis.",
 )
-@image_option("-o", "output", default="pndf.png", show_default=True, help="Drawing to write.")
+@click.option(
+    "-o",
+    "output",
+    type=click.Path(path_type=Path),
+    callback=_parse_figure,
+    default="pndf.png",
+    show_default=True,
+    help="Figure to write: .png, .pdf or .svg; or its numbers: .npz.",
+)
 @_variant_option
 @_define_option("Parameter of the BSDF; may be repeated.")
 def pndf(
     plugin: str,
-    map_file: Path,
+    map_file: Path | None,
     uv: tuple[float, float],
     sigma: float,
     res: int,
@@ -384,16 +397,23 @@ def pndf(
 ) -> None:
     """Draw a P-NDF beside its reference.
 
-    The left half is the plugin's density over the disk of normals, the right half a reference that
-    counts samples. The command prints the relative L1 difference, the difference that noise alone
-    would make, and the time.
+    The figure has the plugin's density over the disk of normals, a reference that counts samples of
+    the map's normals, and the footprint on the map. Without a map, the reference counts normals
+    that the plugin draws. The command prints the relative L1 difference, the difference that noise
+    alone would make, what that means, and the time.
     """
+    from glintbsdf.check import comparison, plot
+
     _activate(variant)
-    _refuse_same(output, map_file)
+    if map_file is not None:
+        _refuse_same(output, map_file)
     with rendering.replacing(output) as unfinished:
-        comparison = pndf_plot.compare(plugin, map_file, uv, sigma, res, definitions)
-        rendering.save(comparison.drawing(), unfinished)
-    click.echo(comparison)
+        compared = comparison.compare(plugin, map_file, uv, sigma, res, definitions)
+        if output.suffix.lower() == ".npz":
+            compared.save(unfinished)
+        else:
+            plot.pndf(compared).savefig(unfinished, dpi=120)
+    click.echo(compared)
     click.echo(output)
 
 
