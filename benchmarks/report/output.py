@@ -159,7 +159,7 @@ def fronts(rows: list[dict]) -> Table:
     for row in rows:
         for position, point in enumerate(row["front"]):
             where = ("", "") if position else (row["map"], f"{row['radius']:g}")
-            told = point["l1"] > pareto.TELLABLE * point["noise_l1"]
+            told = point["l1"] > pareto.DETECTABLE * point["noise_l1"]
             found.add_row(
                 *where,
                 f"{1e6 * point['seconds_per_query']:.2g}",

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-#: Errors (relative L1) that one may ask for.
+#: Tolerated errors (relative L1).
 TOLERANCES = (0.2, 0.1, 0.05, 0.02)
 
-#: No measurement tells an error up to this many times its noise from none.
-TELLABLE = 1.5
+#: Errors up to this many times their noise cannot be distinguished from zero.
+DETECTABLE = 1.5
 
-#: Times within this factor of the fastest are as good: small footprints take all variants of a
-#: method to one and the same code.
+#: Times within this factor of the fastest count as equal: for small footprints, all variants of a
+#: method run the same code.
 AS_FAST = 1.3
 
 
 def excess(point: dict, metric: str = "l1") -> float:
     """The error of a point, or 0 where it cannot be told from the noise."""
-    return point[metric] if point[metric] > TELLABLE * point[f"noise_{metric}"] else 0.0
+    return point[metric] if point[metric] > DETECTABLE * point[f"noise_{metric}"] else 0.0
 
 
 def front(points: list[dict], cost: str = "seconds_per_query", metric: str = "l1") -> list[dict]:

@@ -258,7 +258,7 @@ class FootprintBSDF(mi.BSDF):
         )
 
     def members(self) -> dict[str, object]:
-        """What describes this BSDF in print, by name; values of None are left out."""
+        """Values for the printed description of this BSDF, by name; None is left out."""
         return {
             "to_uv": None if self.to_uv == type(self.to_uv)() else self.to_uv,
             "footprint_sigma": self.footprint_sigma[0],

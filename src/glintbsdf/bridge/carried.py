@@ -37,7 +37,7 @@ NO_VARIANCE = 2.0**-60
 
 @dataclass(frozen=True)
 class Carried:
-    """What a surface interaction carries.
+    """The data that a surface interaction carries.
 
     Attributes:
         w_u, w_v (mi.Vector3f): turn of the half vector, world space, per unit of u and of v.
@@ -62,8 +62,8 @@ class Carried:
 
     @staticmethod
     def of(si: mi.SurfaceInteraction3f) -> Carried | None:
-        """What ``si`` carries; None where it is known while a kernel is recorded that it carries
-        nothing. Lanes that turn out to carry nothing have no turn and a variance of 0."""
+        """The data that ``si`` carries; None if it is known while a kernel is recorded that it
+        carries nothing. Lanes that carry nothing at run time have a turn and a variance of 0."""
         if all(is_literal_zero(x) for x in si.dn_dv):
             return None
         normal = mi.Vector3f(si.n)

@@ -1,4 +1,4 @@
-"""From colours to what the variant of Mitsuba computes with: colours, brightness or spectra."""
+"""Conversion of colours to the variant's representation: colours, luminance or spectra."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ColorConversion:
     def eval(
         self, color: mi.Color3f, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> mi.UnpolarizedSpectrum:
-        """What ``color`` (linear RGB) is in this variant, at the wavelengths of ``si``."""
+        """``color`` (linear RGB) in this variant's representation, at the wavelengths of ``si``."""
         if mi.is_monochromatic:
             return mi.UnpolarizedSpectrum(mi.luminance(color))
         if not mi.is_spectral:

@@ -506,8 +506,8 @@ def check_render_derivative(
         dr.enable_grad(params[name])
         params.update()
         if mode == "forward":
-            # What an update derives from a parameter lies outside of the rendering: it takes its
-            # derivative first, as Mitsuba asks it of everybody who goes forward.
+            # Quantities that an update derives from a parameter are not part of the rendering, so
+            # their derivatives are propagated first, as Mitsuba requires in forward mode.
             dr.set_grad(params[name], grown(0))
             dr.enqueue(dr.ADMode.Forward, params[name])
             dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)

@@ -1,1 +1,1 @@
-"""What every floor stands on: errors, the cache on disk, progress, random numbers."""
+"""Common base of all other packages: errors, the cache on disk, progress, random numbers."""

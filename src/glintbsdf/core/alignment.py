@@ -1,7 +1,7 @@
-"""Where arrays begin in memory.
+"""Alignment of arrays in memory.
 
-Dr.Jit takes over the memory of NumPy's arrays, and its kernels for memory that begins at a cache
-line are others than those for memory that does not.
+Dr.Jit uses the memory of NumPy's arrays, and its kernels for memory that begins at a cache
+line differ from those for other memory.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 _LINE = 64  # bytes
 
 #: Memory of this size, bytes, comes from the system in whole pages, and always begins at the same
-#: place in a page. So it needs no copy.
+#: place in a page. So no copy is needed.
 _LARGE = 1 << 26
 
 

@@ -67,7 +67,7 @@ NOTHING = Domain(columns=(0, -1), rows=(0, -1), smallest=0.0, largest=0.0)
 
 
 class Extent(NamedTuple):
-    """What one query touches: texels (``mi.Int``), and the footprint's standard deviations along
+    """Texels that one query touches (``mi.Int``), and the footprint's standard deviations along
     its axes (``mi.Float``, texels)."""
 
     left: mi.Int
@@ -79,7 +79,7 @@ class Extent(NamedTuple):
 
 
 def extent(footprint: Footprint, shape: MapShape) -> Extent:
-    """What a footprint touches, with the widest of all kernels."""
+    """The extent of a footprint with the widest of all kernels."""
     kernel = TexelKernel("gaussian", footprint, shape.height, shape.width, shape.wrap_mode)
     mean = kernel.mean
     both = dr.square(kernel.sigma_u) + dr.square(kernel.sigma_v)
@@ -120,7 +120,7 @@ class Recorder:
         return footprint
 
     def found(self) -> Domain | None:
-        """What all queries together have touched; None if there was none."""
+        """The domain of all queries so far; None if there was none."""
         left, right, top, bottom, minor, major = (int(x) for x in self.largest.numpy())
         if right == self.NEVER:
             return None

@@ -1,8 +1,8 @@
 """The lattice of texels: the plane over which a finite map repeats, mirrors or stretches.
 
 Texel (row i, column j) has its centre at the position (x, y) = (j, i). The quad (i, j) spans four
-texels, (i, j) to (i+1, j+1): the plane is tiled by quads. What is stored per quad is stored for a
-finite rectangle of quads, and this module says which of them a quad of the plane looks like.
+texels, (i, j) to (i+1, j+1): the plane is tiled by quads. Data per quad are stored for a
+finite rectangle of quads, and this module gives the stored quad for any quad of the plane.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class LatticeAxis:
     Attributes:
         block (int): side of a block of quads, a power of two.
         quads (int): quads stored. ``repeat``: one period; ``mirror``: a period of 2 × ``texels``;
-            ``clamp``: the map between two borders of whole blocks, which stand for the constant
-            strips that go on for ever.
+            ``clamp``: the map between two borders of whole blocks, which represent the constant
+            strips beyond, which are infinite.
         source (int32 array of ``quads + 1``): the texel shown by each stored vertex.
     """
 
@@ -62,10 +62,10 @@ class LatticeAxis:
         return dr.opaque(mi.Float, 1 / self.quads)
 
     def locate(self, x):
-        """Where the quad at the position ``x`` (``mi.Int``, texels) is stored.
+        """Index of the stored quad for the position ``x`` (``mi.Int``, texels).
 
         Returns ``(origin, index, end)``: ``x = origin + index`` with ``index`` in [0, ``quads``),
-        and all of [``index``, ``end``) is stored from this origin on without a break.
+        and all of [``index``, ``end``) is stored contiguously from this origin.
         """
         if not self.clamped:
             origin = floor_int((mi.Float(x) + 0.5) * self.inverse_count) * self.count
@@ -88,7 +88,7 @@ class LatticeAxis:
         if self.clamped:
             first = min(max(first + self.block, 0), self.quads - self.block)
             last = min(max(last + self.block, 0), self.quads - 1)
-            if first < self.block:  # any place in the border stands for what is beyond
+            if first < self.block:  # any place in the border represents all beyond
                 first = 0
             if last >= self.quads - self.block:
                 last = self.quads - 1
@@ -100,7 +100,7 @@ class LatticeAxis:
         return first, (last - first) % self.blocks + 1
 
     def following(self, x, index):
-        """Where the quad after ``x`` is stored, given where ``x`` is."""
+        """Index of the quad after ``x``, from the ``index`` of ``x``."""
         if self.clamped:
             return self.locate(x + 1)[1]
         return dr.select(index == self.count - 1, 0, index + 1)

@@ -75,7 +75,7 @@ class RayCone:
         )
 
     def turned_per_uv(self, si: mi.SurfaceInteraction3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-        """How the direction towards the ray's origin changes over the surface at ``si``, per unit
+        """Change of the direction towards the ray's origin over the surface at ``si``, per unit
         of u and of v: the cone's change per pixel, by the UV partials of a pixel that ``si`` has.
 
         Zero where these are degenerate.

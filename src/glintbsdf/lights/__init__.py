@@ -1,1 +1,1 @@
-"""What of a scene's lights is integrated rather than sampled."""
+"""Lights of a scene that are integrated instead of sampled."""

@@ -200,7 +200,7 @@ class SmallLights:
 
 
 def most_powerful(emitters: list, indices: list[int], most: int) -> list[int]:
-    """Those of the ``indices`` that belong to the ``most`` most powerful emitters, in order."""
+    """The subset of ``indices`` of the ``most`` most powerful emitters, in order."""
     if len(indices) <= most:
         return indices
     powers = [power(emitters[k]) for k in indices]

@@ -1,9 +1,9 @@
-"""From the numbers of an image to projected normals, and how it is decided what the numbers mean.
+"""Conversion of an image's numbers to projected normals, and the choice of their interpretation.
 
-What a file says of itself decides little: normals in [-1, 1] and normals stored as (n + 1)/2 both
-come as floating-point numbers, heights come in three channels and normals in one of colour and one
-of alpha. So ``auto`` looks at the numbers. Every decision that another reading could contradict is
-a :class:`Note`, in one sentence with its remedy.
+The type of a file decides little: normals in [-1, 1] and normals stored as (n + 1)/2 both
+come as floating-point numbers, heights come in three channels, and normals in one of colour and one
+of alpha. So ``auto`` examines the numbers. Every decision that has a plausible alternative is
+a :class:`Note`, one sentence with a remedy.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class Note(NamedTuple):
 
 @dataclass
 class Decoding:
-    """How the numbers of an image become normals.
+    """Conversion of the numbers of an image to normals.
 
     Attributes:
         map_type: ``auto``, ``normal`` or ``height``. By ``auto``, one channel is a height, and so
-            are three that are equal but for a few levels of 8 bits.
+            are three that are equal except for a few levels of 8 bits.
         height_scale: texels per unit of height; may be negative.
         wrap_mode: ``repeat``, ``mirror`` or ``clamp``.
         encoding: how normals are stored. ``signed``: components in [-1, 1]; ``unsigned``: stored
@@ -54,7 +54,7 @@ class Decoding:
             A texel holds nothing where a value is NaN or infinite; where its alpha is 0 and others
             have more; where a height is -9999, -32767, -32768, below -1e30 or the value that the
             file names; where a normal has length 0, or is stored as black.
-        owner, parameter: the names that errors give.
+        owner, parameter: names for error messages.
         void: the value that the file gives to places without data, if it names one.
         notes: what has been decided.
         reads_height: whether it was a height.
@@ -320,10 +320,10 @@ def check_texels(
 
 
 def curl(normals: np.ndarray) -> tuple[float, float]:
-    """How far projected normals are from those of any height, as they are and with y reversed.
+    """Deviation of projected normals from those of a height, as they are and with y reversed.
 
     The slopes p and q of a height have ``∂p/∂y = ∂q/∂x``. Returned is the mean of the difference of
-    both, over the mean of the sum of their amounts, in [0, 1]. It is 0 for a height; with y
+    both, over the mean of the sum of their magnitudes, in [0, 1]. It is 0 for a height; with y
     reversed the sum takes the place of the difference. Maps of more than a million texels are
     judged by a band of rows. A map without any such derivative gives (0, 0).
     """
@@ -362,7 +362,7 @@ def _of_type(fractions: np.ndarray, like: np.ndarray) -> np.ndarray:
 
 
 def _unit(data: np.ndarray) -> float:
-    """What counts as the range of the values; for integers it is the range of their type."""
+    """The range of the values; for integers, the range of their type."""
     if data.dtype.kind in "ui":
         return float(np.iinfo(data.dtype).max)
     finite = data[np.isfinite(data)]

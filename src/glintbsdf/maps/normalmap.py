@@ -55,7 +55,7 @@ _DECISIVE = 4
 
 
 class MapShape(NamedTuple):
-    """How large a map is, and what lies beyond its border: all that footprints need to know."""
+    """Size and wrap mode of a map: all that footprints need to know of it."""
 
     height: int
     width: int
@@ -65,7 +65,7 @@ class MapShape(NamedTuple):
 def map_bytes(normal_map: NormalMap) -> int:
     """Memory of a map and of its tensor in the active variant, bytes.
 
-    On the CPU the tensor is the NumPy array itself; a GPU has a copy of its own.
+    On the CPU the tensor is the NumPy array itself; a GPU has a separate copy.
     """
     import mitsuba as mi
 
@@ -76,10 +76,11 @@ class NormalMap:
     """A map of unit normals.
 
     ``normals`` is an H x W x 2 array of projected normals (x, y), every one strictly inside the
-    unit disk; the map keeps a read-only float32 copy. ``wrap_mode`` says what lies beyond its
+    unit disk; the map keeps a read-only float32 copy. ``wrap_mode`` continues the map beyond its
     border: ``repeat``, ``mirror`` (about the border, so texel -1 is texel 0) or ``clamp``. A
-    mirrored texel keeps its value, as in Mitsuba. ``notes`` tells what has been decided in reading
-    it, ``is_height`` whether it was a height, ``green_is_given`` whether ``flip_y`` was stated.
+    mirrored texel keeps its value, as in Mitsuba. ``notes`` lists the decisions made in reading
+    it, ``is_height`` states whether it was a height, ``green_is_given`` whether ``flip_y`` was
+    stated.
 
     ``owner`` and ``parameter`` are named in the :class:`~.ParameterError` that is
     raised for a wrong shape, for NaN or infinite values and for normals on or outside the disk.
@@ -268,7 +269,7 @@ class NormalMap:
 
     @cached_property
     def curl(self) -> tuple[float, float]:
-        """How far the normals are from those of any height: as they are, and with y reversed."""
+        """Deviation of the normals from those of a height, as they are and with y reversed."""
         return curl(self.normals)
 
     @property

@@ -1,4 +1,4 @@
-"""Read image files that hold a map: the numbers as they are stored, and what was chosen of them.
+"""Read image files with a map: the numbers as they are stored, and the choice of layer or channels.
 
 Nothing is decoded here: no gamma is undone, and integers stay integers. File readers are imported
 when a file of their kind is read.
@@ -13,10 +13,10 @@ import numpy as np
 
 from glintbsdf.core.errors import ParameterError, check, describe
 
-# What makes a map among the channels of an EXR file, the most telling names first.
+# Sets of channels of an EXR file that can be a map, the most specific names first.
 _EXR_LAYOUTS = (("R", "G", "B"), ("X", "Y", "Z"), ("R", "G"), ("X", "Y"), ("Y",))
 
-#: What the layer of a map may be called, by what the map is taken for.
+#: Names of layers, by type of map.
 _LAYER_NAMES = {
     "auto": ("normal",),
     "normal": ("normal",),
@@ -28,12 +28,12 @@ _GDAL_NODATA = 42113  # a TIFF tag: the value of places without data
 
 @dataclass(frozen=True)
 class Picture:
-    """What a file holds.
+    """The content of a file.
 
     Attributes:
         data: H x W or H x W x C values.
         void: the value that the file gives to places without data, or None.
-        note: a sentence about what was taken of several possibilities, or empty.
+        note: a sentence about the choice among several possibilities, or empty.
     """
 
     data: np.ndarray
@@ -42,7 +42,7 @@ class Picture:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file of this name, which may be none that the system can have."""
+    """Whether there is a file of this name, which may be invalid as a name."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # a name too long for the system, or with a null in it

@@ -86,7 +86,7 @@ class Gaussian:
         """Two vectors (a, b) and (0, c) whose outer products add up to the covariance."""
         extended = self.xx > 0
         inverse = mi.Float(dr.select(extended, dr.rsqrt(dr.select(extended, self.xx, 1)), 0))
-        # Where xx vanishes so does xy, and the determinant says nothing of yy.
+        # If xx is zero, so is xy, and the determinant does not depend on yy.
         c = dr.select(extended, dr.sqrt(self.determinant) * inverse, dr.sqrt(self.yy))
         return mi.Vector2f(self.xx * inverse, self.xy * inverse), mi.Vector2f(0, c)
 
@@ -97,12 +97,12 @@ class Gaussian:
 
 
 class Overlap:
-    """What a footprint sees of a lobe.
+    """The part of a lobe under a footprint.
 
-    Where all lobes have the same S, make one per footprint: it serves them all.
+    If all lobes have the same S, one object per footprint is enough for all.
 
     Args:
-        footprint (Gaussian): Σ_p; zero is legal.
+        footprint (Gaussian): Σ_p; may be zero.
         lobe (Gaussian): S, in the same units.
 
     Attributes:

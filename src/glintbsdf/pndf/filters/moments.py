@@ -325,7 +325,7 @@ def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
 
 
 class LevelSamples(NamedTuple):
-    """How a level's samples are stored. Vectors hold a value for x and one for y.
+    """Layout of a level's samples. Vectors have a value for x and one for y.
 
     Attributes:
         offset: index of the first sample of the whole level, even if only a part is stored.
@@ -584,7 +584,7 @@ class MomentPyramid:
         return central(origin, [total / weights for total in totals], self.spread)
 
     def grid(self, level) -> LevelSamples:
-        """How the samples of a level (``mi.Float``) are stored."""
+        """Layout of the samples of a level (``mi.Float``)."""
         index = mi.UInt32(level - opaque(mi.Float, self.first))
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
         variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
