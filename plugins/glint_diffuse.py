@@ -109,6 +109,9 @@ class GlintDiffuse(FootprintBSDF):
         else:
             self.method = OrenNayarDiffuse(self.mesh, domain)
 
+    def remedies(self) -> list[str]:
+        return ['"method" oren_nayar visits no triangle'] if self.method_name == "manifold" else []
+
     def parts(self) -> dict[str, int]:
         return self.mesh.parts() | (self.method.parts() if self.method is not None else {})
 

@@ -155,5 +155,10 @@ class GlintElements(GlintBSDF):
             return Flakes(**self.options)
         return Elements(self.normal_map, domain=domain, **self.options)
 
+    def remedies(self) -> list[str]:
+        if self.normal_map is None:
+            return []
+        return ['glint_manifold with "max_error" 0.05 bounds the cost of wide footprints']
+
 
 register_plugin("glint_elements", GlintElements)

@@ -180,6 +180,14 @@ class GlintManifold(GlintBSDF):
             return HandOver(pndf, self.hand_over, self.owner, domain)
         return pndf
 
+    def remedies(self) -> list[str]:
+        found = []
+        if self.method is not TabulatedManifold:
+            found.append('"max_error" 0.05 bounds the cost of wide footprints')
+        if self.masking_name == "analytic":
+            found.append('"masking" ggx_fit visits no triangle')
+        return found
+
     def left_out(self) -> list[str]:
         features = {
             "clusters: threshold is 0": "threshold" in self.options,

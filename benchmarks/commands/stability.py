@@ -39,8 +39,9 @@ from benchmarks.harness import (
 )
 from benchmarks.methods import NARROWEST_LOBE, NO_MAP, STIFF, VERTICAL, WIDTHS, Stiff, stiff_map
 from benchmarks.report import page
-from glintbsdf.check import densities, robustness
+from glintbsdf.check import densities, fuzz, robustness
 from glintbsdf.check.suite import View
+from glintbsdf.cli.entry import one_line
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.scene.rendering import replacing
@@ -152,9 +153,8 @@ def measure(row: Row) -> dict:
 
 
 def in_a_line(error: Exception) -> str:
-    """The message of an error; in Mitsuba's errors, it is the last line of Python's traceback."""
-    lines = [line.strip() for line in f"{type(error).__name__}: {error}".splitlines()]
-    return next((line for line in reversed(lines) if "Error: " in line), lines[0])
+    """What an error is, and what it says."""
+    return f"{type(error).__name__}: {one_line(str(error))}"
 
 
 def extent(row: Row, bsdf: mi.BSDF) -> tuple[float, float]:
@@ -415,11 +415,30 @@ def run(rows: list[Row], folder: Path, console: Console) -> int:
     return status or int(broken > 0)
 
 
+def fuzzed(count: int, seed: int, store: Store) -> fuzz.Report:
+    """Values of every kind for every parameter, a thousand to a seed; none is tried twice."""
+    total = fuzz.Report()
+    with progress("Values of parameters") as report:
+        while total.cases < count:
+            key = {"cases": min(1000, count - total.cases), "seed": seed + total.cases // 1000}
+            found = store.get(key, lambda: (vars(fuzz.fuzz(key["cases"], key["seed"])), {}))[0]  # noqa: B023
+            total.include(fuzz.Report(**found))
+            report(total.cases / count)
+    return total
+
+
 @click.command(help=__doc__, short_help=__doc__.splitlines()[0])
+@click.option("--fuzz", "cases", type=int, help="In place of rows, so many values of parameters.")
+@click.option("--seed", default=1, help="Of the first thousand of these values.")
 @click.option("--quick", is_flag=True, help="Only the stiffest maps, in two minutes.")
 @click.option("--only", metavar="TEXT", default="", help="Only rows whose name has this.")
-def stability(quick: bool, only: str, output: Path, variant: str) -> int:
+def stability(
+    cases: int | None, seed: int, quick: bool, only: str, output: Path, variant: str
+) -> int:
     mi.set_variant(variant)
+    if cases:
+        print(found := fuzzed(cases, seed, open_store(output, __file__)))
+        return int(bool(found.faults))
     rows = [row for row in plan(quick) if only in row.name]
     return run(rows, output, new_console())
 

@@ -31,7 +31,7 @@ def test_used_values_are_finite():
     """In separate processes, so that crashes and endless loops are outcomes, too."""
     report = fuzz(60, seed=4)
     assert not report.faults, str(report)
-    assert report.counts.total() == 60 and report.counts["used"] > 2
+    assert report.cases == 60 and report.counts["used"] > 2
 
 
 @pytest.mark.parametrize(

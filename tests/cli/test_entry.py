@@ -533,6 +533,13 @@ def test_errors_of_python_plugins_lose_their_traceback():
     )
 
 
+def test_a_long_rendering_is_foreseen(run, folder, monkeypatch):
+    monkeypatch.setattr("glintbsdf.scene.estimation.LONG", 0.0)
+    _, _, errors = run("render", "scene.xml")
+    assert errors.startswith("Note: rendering takes about 0 s, and glints ")
+    assert 'glint_manifold: "max_error" 0.05 bounds' in errors and "--time-limit" in errors
+
+
 def test_help_names_the_commands(run):
     status, output, _ = run("--help")
     assert status == 0 and all(name in output for name in ("render", "pndf", "doctor"))

@@ -32,6 +32,34 @@ def test_progress(monkeypatch, stream, seconds, shown):
     assert ("Building lists" in stream.getvalue()) == shown
 
 
+def test_bars_are_under_each_other(monkeypatch):
+    """Work may be a part of other work: both have a bar, and the last takes the display away."""
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(module, "_DELAY", 0.05)
+    monkeypatch.setenv("TERM", "xterm")
+    with progress("Inspecting"):
+        with progress("Building lists") as report:
+            report(0.5)
+            time.sleep(0.4)
+        assert module._bars.shown is not None
+    assert "Inspecting" in stream.getvalue() and "Building lists" in stream.getvalue()
+    assert module._bars.shown is None and not module._bars.timers
+
+
+def test_much_time_is_foreseen(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(module, "_SURE", 0.0)
+    for fraction, expected in ((1e-4, 1), (0.9, 0)):
+        stream.truncate(0)
+        with progress("Rendering", 3e9) as report:
+            time.sleep(0.05)
+            report(fraction)
+            report(2 * fraction)
+        assert stream.getvalue().count("Rendering (3.0 GB): 0 % after 0 s, about ") == expected
+
+
 def test_errors_pass_through(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     with pytest.raises(RuntimeError, match="no"), progress("Building"):

@@ -41,9 +41,11 @@ def test_units_are_small_and_make_the_whole(variant, plan):
 @pytest.mark.parametrize("spp, pixels, count", [
     (16, 100, 1),  # a small image is rendered at once
     (16, 1 << 18, 16),  # at most one pass per sample
-    (64, 1 << 14, 4),
-    (12, 1 << 17, 6),
-    (13, 1 << 16, 3),
+    (64, 1 << 14, 8),
+    (12, 1 << 17, 8),
+    (13, 1 << 16, 8),
+    (64, 1 << 10, 4),
+    (96, 1 << 17, 48),
     (1, 1 << 24, 1),
 ])  # fmt: skip
 def test_number_of_passes(spp, pixels, count):

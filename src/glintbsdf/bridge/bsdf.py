@@ -81,6 +81,7 @@ class FootprintBSDF(mi.BSDF):
         to_uv (mi.ScalarAffineTransform3f): transform of UV space.
         footprint_sigma, pixel_spread (mi.Float): see :meth:`Footprint.from_interaction`.
         normal_map (NormalMap): the map as it was loaded, None without one.
+        green_is_given (bool): whether ``flip_y`` was given.
         watch (Recorder | Gate): gets every footprint; None by default.
 
     Raises :class:`~.ParameterError` for values that are not allowed.
@@ -100,6 +101,7 @@ class FootprintBSDF(mi.BSDF):
         _alive.add(self)
         self.owner, self.name = props.plugin_name(), props.id()
         self.deferred = props.get("deferred", False)
+        self.green_is_given = "flip_y" in props
         parameters = Parameters(props)
         parameters.refuse_unknown()
         self.to_uv = parameters.to_uv()
@@ -122,6 +124,10 @@ class FootprintBSDF(mi.BSDF):
 
     def left_out(self) -> list[str]:
         """Features that the parameters switch off, and why, in words."""
+        return []
+
+    def remedies(self) -> list[str]:
+        """Parameters that would make evaluation faster, and how, in words."""
         return []
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -189,8 +195,9 @@ class FootprintBSDF(mi.BSDF):
         self.looked_at_surfaces = True
         shapes = shapes_of(self)
         require_uvs(self.owner, shapes)
-        doubt = doubt_of_green(self.normal_map, self.to_uv, shapes)
-        if doubt:
+        if self.normal_map is None or self.green_is_given:
+            return
+        if doubt := doubt_of_green(self.normal_map, self.to_uv, shapes):
             warn(f'{self.owner} "{self.name}": {doubt}')
 
     def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:

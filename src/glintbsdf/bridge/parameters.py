@@ -370,9 +370,7 @@ class Parameters:
             "flip_y": self.boolean("flip_y", False),
             "owner": self.owner,
         }
-        normal_map = self._read_map(source, value, options)
-        normal_map.green_is_given = "flip_y" in self.props
-        return normal_map
+        return self._read_map(source, value, options)
 
     def _read_map(self, source: str, value: object, options: dict) -> NormalMap:
         if source == "filename":

@@ -140,16 +140,14 @@ def uv_orientation(shape: mi.Shape) -> int:
 
 
 def doubt_of_green(
-    normal_map: NormalMap | None, to_uv: mi.ScalarAffineTransform3f, shapes: list[mi.Shape]
+    normal_map: NormalMap, to_uv: mi.ScalarAffineTransform3f, shapes: list[mi.Shape]
 ) -> str:
     """A warning if the map's normals fit together on these shapes only with a reversed green.
 
     The second component of a normal points along v on right-handed UVs, and against v on
     left-handed ones, as the shading frame does; ``to_uv`` may mirror the map once more. The result
-    is empty if ``flip_y`` was given, if the shapes disagree, or if the normals fit as they are.
+    is empty if the shapes disagree, or if the normals fit as they are.
     """
-    if normal_map is None or normal_map.green_is_given:
-        return ""
     orientations = {uv_orientation(shape) for shape in shapes}
     if orientations not in ({1}, {-1}):
         return ""

@@ -28,6 +28,9 @@ _SUBSAMPLES = 4
 # Without a map, the grid of bins holds all samples but for this share on each side, and a margin.
 _TAIL = 1e-3
 
+#: Number of queries between two reports of progress.
+_TOGETHER = 1 << 16
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -156,11 +159,19 @@ def compare(
 
     few = dr.gather(mi.Vector2f, m, dr.arange(mi.UInt32, 16))
     dr.eval(few)
-    with progress("Evaluating the density"):
+    seconds, parts = 0.0, []
+    with progress("Evaluating the density") as report:
         _values(pndf, few, footprint)  # compiles the kernel
-        start = time.perf_counter()
-        density = _values(pndf, m, footprint)
-        seconds = time.perf_counter() - start
+        for first in range(0, count * count, _TOGETHER):
+            part = dr.arange(mi.UInt32, first, min(first + _TOGETHER, count * count))
+            normals = dr.gather(mi.Vector2f, m, part)
+            dr.eval(normals)
+            dr.sync_thread()
+            start = time.perf_counter()
+            parts.append(_values(pndf, normals, footprint))
+            seconds += time.perf_counter() - start
+            report((first + len(parts[-1])) / (count * count))
+    density = np.concatenate(parts)
 
     points = density.reshape(res, _SUBSAMPLES, res, _SUBSAMPLES)
     mean = points.mean(axis=(1, 3), dtype=np.float64)

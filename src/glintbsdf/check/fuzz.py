@@ -4,30 +4,34 @@ A case is a plugin, and values of any kind for one or two of its parameters: num
 1e39, NaN, names, colours, vectors, transforms, tensors, images, textures, nested materials. Some
 parameters do not exist. A case must end in one of two ways: with an error of one sentence that
 names the plugin and the parameter; or with a BSDF whose values and samples are finite from the
-zenith to the horizon, for footprints from a point to many maps.
+zenith to the horizon, for footprints from a point to many maps, or an integrator that renders a
+picture.
 
 :func:`cases` and :func:`outcome` work in this process. :func:`fuzz` runs any number of cases in
-separate processes, so that crashes and endless loops are outcomes as well. It is the long check of
-the stability report::
+separate processes, so that crashes and endless loops are outcomes as well. It is part of the
+stability report, ``python -m benchmarks stability --fuzz 20000``::
 
     from glintbsdf.check.fuzz import fuzz
-    print(fuzz(20_000, seed=1))
+    print(fuzz(1000, seed=1))
 """
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-#: Seconds that a case may take, with the compilation of its kernels.
-PATIENCE = 60.0
+#: Seconds of processor time that a case may take, with the compilation of its kernels; and the
+#: factor to the limit in seconds of the clock, for a case that waits for ever.
+PATIENCE, CLOCK = 60.0, 20
 
 #: Larger values than these are allowed, but take long to build; cases use these at most.
 _COSTLY = {"output_size": 128, "flake_density": 1e5}
@@ -208,7 +212,7 @@ def base(plugin: str) -> dict:
 def outcome(case: Case, evaluate: bool = True) -> str:
     """The outcome of a case: one of :data:`GOOD`, or a sentence about the fault.
 
-    ``evaluate``: whether to evaluate the BSDF as well, which compiles kernels.
+    ``evaluate``: whether to evaluate the plugin as well, which compiles kernels.
     """
     import mitsuba as mi
 
@@ -224,8 +228,9 @@ def outcome(case: Case, evaluate: bool = True) -> str:
     except Exception as error:
         return judged(case, str(error))
     try:
-        evaluate = evaluate and hasattr(loaded, "eval_pdf")
-        return judged_values(loaded) if evaluate else "used"
+        if not evaluate:
+            return "used"
+        return (judged_values if isinstance(loaded, mi.BSDF) else judged_picture)(loaded)
     except Exception as error:
         return f"evaluation fails: {type(error).__name__}: {str(error)[-300:]}"
 
@@ -273,23 +278,52 @@ def judged_values(bsdf: Any) -> str:
     ctx = mi.BSDFContext()
     bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(mi.Float(u[1]), mi.Float(u[2])))
     wo = mi.warp.square_to_uniform_hemisphere(mi.Point2f(mi.Float(u[1]), mi.Float(u[0])))
+    at_sample, pdf = bsdf.eval_pdf(ctx, si, bs.wo)
     values = {
         "weight": weight,
         "sampled pdf": bs.pdf,
         "value": bsdf.eval_pdf(ctx, si, wo)[0],
-        "value at sample": bsdf.eval_pdf(ctx, si, bs.wo)[0],
-        "pdf": bsdf.eval_pdf(ctx, si, bs.wo)[1],
+        "value at sample": at_sample,
+        "pdf": pdf,
     }
     if mi.is_polarized:
         values = {k: v[0, 0] if isinstance(v, mi.Spectrum) else v for k, v in values.items()}
     dr.eval(values)
     for name, value in values.items():
-        array = np.array(value)
-        if not np.isfinite(array).all():
-            return f"{name} is not finite"
-        if (array < 0).any():
-            return f"{name} is negative"
+        if (fault := fault_of(np.array(value))) is not None:
+            return f"{name} {fault}"
     return "used"
+
+
+def judged_picture(integrator: Any) -> str:
+    """Whether the picture that an integrator renders is finite and not negative."""
+    import mitsuba as mi
+
+    sensor = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([0, 1, 3], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 8, "height": 8},
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": sensor,
+            "plate": {"type": "rectangle", "bsdf": base("glint_elements")},
+            "lamp": {"type": "sphere", "center": [0, 1, 2], "radius": 0.1,
+                     "emitter": {"type": "area", "radiance": 10.0}},
+            "sky": {"type": "constant"},
+        }
+    )  # fmt: skip
+    fault = fault_of(np.array(mi.render(scene, spp=4)))
+    return "used" if fault is None else f"the picture {fault}"
+
+
+def fault_of(values: np.ndarray) -> str | None:
+    """What is wrong with numbers that must be finite and not negative."""
+    if not np.isfinite(values).all():
+        return "is not finite"
+    return "is negative" if (values < 0).any() else None
 
 
 # --------------------------------------------------------------------------------------------------
@@ -303,25 +337,34 @@ class Report:
 
     Attributes:
         counts: number of cases with each good outcome, and with "fault".
-        faults: the cases that are faults, with their outcomes.
-        slowest: seconds of the slowest case, and the case.
+        faults: the cases that are faults, in words, with their outcomes.
+        slowest: seconds of processor time of the slowest case, and the case.
     """
 
-    counts: Counter = field(default_factory=Counter)
-    faults: list[tuple[Case, str]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=Counter)
+    faults: list[tuple[str, str]] = field(default_factory=list)
     slowest: tuple[float, str] = (0.0, "")
 
     def add(self, case: Case, result: str, seconds: float = 0.0) -> None:
         """Count the outcome of a case."""
         good = result in GOOD
-        self.counts[result if good else "fault"] += 1
-        if not good:
-            self.faults.append((case, result))
-        self.slowest = max(self.slowest, (seconds, str(case)))
+        faults = [] if good else [(str(case), result)]
+        self.include(Report({result if good else "fault": 1}, faults, (seconds, str(case))))
+
+    def include(self, other: Report) -> None:
+        """Enter all that another report has."""
+        self.counts = Counter(self.counts) + Counter(other.counts)
+        self.faults = [*self.faults, *other.faults]
+        self.slowest = max(self.slowest, tuple(other.slowest))
+
+    @property
+    def cases(self) -> int:
+        """How many cases are in."""
+        return sum(self.counts.values())
 
     def __str__(self) -> str:
         counts = ", ".join(f"{count} {name}" for name, count in sorted(self.counts.items()))
-        lines = [f"{self.counts.total()} cases: {counts}"]
+        lines = [f"{self.cases} cases: {counts or 'none'}"]
         lines += [f"{case}\n    {result}" for case, result in self.faults]
         return "\n".join([*lines, f"slowest: {self.slowest[0]:.1f} s, {self.slowest[1]}"])
 
@@ -351,11 +394,12 @@ def fuzz(
         )
         process.start()
         others.close()
-        running[mine] = [process, None, time.monotonic()]
+        running[mine] = [process, None, (0.0, 0.0)]
 
     def give(connection) -> None:
         if waiting:
-            running[connection][1:] = [waiting.pop(), time.monotonic()]
+            now = processor_time(running[connection][0].pid), time.monotonic()
+            running[connection][1:] = [waiting.pop(), now]
             connection.send(running[connection][1])
         else:
             connection.send(None)
@@ -380,11 +424,11 @@ def fuzz(
                     start()
                 continue
             if index is not None:
-                result.add(every[index], message, time.monotonic() - since)
-                report(result.counts.total() / count)
+                result.add(every[index], message, processor_time(process.pid) - since[0])
+                report(result.cases / count)
             give(connection)
         for connection, (process, index, since) in list(running.items()):
-            if index is not None and time.monotonic() - since > PATIENCE:
+            if index is not None and is_endless(process.pid, since):
                 process.kill()
                 process.join()
                 result.add(every[index], f"no end after {PATIENCE:.0f} s", PATIENCE)
@@ -392,6 +436,21 @@ def fuzz(
                 if waiting:
                     start()
     return result
+
+
+def processor_time(pid: int) -> float:
+    """Seconds of processor time that a process has had; 0 where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def is_endless(pid: int, since: tuple[float, float]) -> bool:
+    """Whether a case takes too long that began at a processor time and at a time of the clock."""
+    used, passed = processor_time(pid) - since[0], time.monotonic() - since[1]
+    return used > PATIENCE or passed > CLOCK * PATIENCE
 
 
 def _known_cases(seed: int, count: int, variant: str, plugins: tuple[str, ...]) -> list[Case]:
@@ -416,9 +475,3 @@ def _work(connection, seed: int, count: int, variant: str, plugins: tuple[str, .
     connection.send("ready")
     while (index := connection.recv()) is not None:
         connection.send(outcome(every[index]))
-
-
-if __name__ == "__main__":
-    import sys
-
-    print(fuzz(int(sys.argv[1]), int(sys.argv[2]) if sys.argv[2:] else 0, workers=2))

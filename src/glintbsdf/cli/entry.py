@@ -28,6 +28,7 @@ from glintbsdf.cli.render_options import (
 )
 from glintbsdf.cli.render_options import options as render_options
 from glintbsdf.core.interruption import interruptible
+from glintbsdf.core.progress import progress
 from glintbsdf.examples import EXAMPLES
 from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
@@ -219,7 +220,8 @@ def render(
     """Render the Mitsuba scene SCENE to an image.
 
     Glint BSDFs whose "pixel_spread" is 0 get the footprint of the camera's pixels. The same command
-    gives the same image, to the last bit.
+    gives the same image, to the last bit. If the rendering takes more than half a minute,
+    the command first prints an estimate, and what would help. Ctrl-C keeps the finished passes.
     """
     options = RenderOptions(**how)
     _activate(variant)
@@ -290,6 +292,10 @@ def sequence(
     rows = frames.read_table(table) if table else []
     parameters = frames.frames_of(definitions, rows, together)
     names = frames.names_of(template, parameters)
+    for output in (sheet, video):
+        for values in parameters:
+            request = ImageRequest(scene, values, variant, spp, seed, denoise, trim)
+            request.refuse_as_output(output)
     if video:
         frames.require_ffmpeg()
     _activate(variant)
@@ -331,7 +337,9 @@ def inspect(
     "render --trim".
     """
     _activate(variant)
-    findings = inspection.inspect(inspection.load(scene, definitions), spp, sensor)
+    inspected = inspection.load(scene, definitions)
+    with progress("Inspecting") as report:
+        findings = inspection.inspect(inspected, spp, sensor, report)
     click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")
 
 

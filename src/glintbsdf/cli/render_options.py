@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from glintbsdf.core.progress import progress
-from glintbsdf.scene import inspection, rendering
+from glintbsdf.scene import estimation, inspection, rendering
 from glintbsdf.scene.image import Image
 from glintbsdf.scene.package import Job, Package, inputs
 from glintbsdf.scene.storage import Checkpoint
@@ -246,13 +246,13 @@ def render_to_file(
         if not request.sensor and len(loaded.sensors()) > 1:
             sensors = rendering.listed(loaded.sensors())
             _tell(f"of the sensors {sensors} the first is rendered, -s names another")
-        with (
-            rendering.Renderer(
-                loaded, request.spp, request.denoise, missed, request.sensor
-            ) as renderer,
-            progress(label if cluster is None else f"{label} by {cluster}") as report,
-        ):
-            picture, interrupted = _produce(request, renderer, how, cluster, report)
+        settings = (request.spp, request.denoise, missed, request.sensor)
+        with rendering.Renderer(loaded, *settings) as renderer:
+            estimate = None if cluster else estimation.estimate(renderer, request.seed)
+            if estimate is not None and estimate.seconds > estimation.LONG:
+                _tell(str(estimate))
+            with progress(label if cluster is None else f"{label} by {cluster}") as report:
+                picture, interrupted = _produce(request, renderer, how, cluster, report)
         rendering.save(picture.bitmap, unfinished)
     if trimmed and not trimmed.sufficed:
         _tell("trimmed structures did not suffice: built in full")

@@ -24,6 +24,7 @@ import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,9 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 __all__ = ["ENCODINGS", "MAP_TYPES", "MAX_SLOPE", "WRAP_MODES", "NormalMap", "check_texels"]
+
+#: The maps of files that are in use, by file and options.
+_loaded: WeakValueDictionary[tuple, NormalMap] = WeakValueDictionary()
 
 _SHAPE = "an H x W x C array with H, W >= 1 and C = 1…4"
 
@@ -79,8 +83,8 @@ class NormalMap:
     unit disk; the map keeps a read-only float32 copy. ``wrap_mode`` continues the map beyond its
     border: ``repeat``, ``mirror`` (about the border, so texel -1 is texel 0) or ``clamp``. A
     mirrored texel keeps its value, as in Mitsuba. ``notes`` lists the decisions made in reading
-    it, ``is_height`` states whether it was a height, ``green_is_given`` whether ``flip_y`` was
-    stated.
+    it, ``is_height`` states whether it was a height. A map never changes: loading the same file
+    again gives the same object.
 
     ``owner`` and ``parameter`` are named in the :class:`~.ParameterError` that is
     raised for a wrong shape, for NaN or infinite values and for normals on or outside the disk.
@@ -122,7 +126,6 @@ class NormalMap:
         self.wrap_mode = wrap_mode
         self.notes: tuple[Note, ...] = ()
         self.is_height = False
-        self.green_is_given = False
 
     @classmethod
     def from_array(
@@ -214,13 +217,19 @@ class NormalMap:
         path = Path(filename)
         check(is_file(path), owner, "filename", "the name of an existing file", str(filename))
         check_choice(owner, "map_type", map_type, MAP_TYPES)
+        status = path.stat()
+        content = path.resolve(), status.st_mtime_ns, status.st_size
+        key = (*content, map_type, height_scale, wrap_mode, layer, flip_y, *decoding.items())
+        if (known := _loaded.get(key)) is not None:
+            known.tell(owner, "filename", path.name)
+            return known
         picture = read(path, map_type, layer, owner)
         data = _as_array(picture.data, owner, "filename")
         picture = Picture(data, picture.void, picture.note)
         options = {"map_type": map_type, "height_scale": height_scale, "wrap_mode": wrap_mode}
-        return cls._decoded(
-            picture, owner, "filename", flip_y, f' "{path.name}"', **options, **decoding
-        )
+        result = cls._decoded(picture, owner, "filename", flip_y, path.name, **options, **decoding)
+        _loaded[key] = result
+        return result
 
     @classmethod
     def _decoded(
@@ -232,7 +241,7 @@ class NormalMap:
         name: str = "",
         **options: Any,
     ) -> NormalMap:
-        """The map of a picture, its notes logged with the ``name`` of its file."""
+        """The map of a picture, its notes told with the ``name`` of its file."""
         decoding = Decoding(
             owner=owner, parameter=parameter, flip_y=bool(flip_y), void=picture.void, **options
         )
@@ -243,10 +252,14 @@ class NormalMap:
         if flip_y is None and (text := result.doubt_of_green(1)):
             decoding.note(text)
         result.notes = tuple(decoding.notes)
-        for note in result.notes:
-            tell = warn if note.doubtful else inform
-            tell(f'{owner}: "{parameter}"{name}: {note.text}')
+        result.tell(owner, parameter, name)
         return result
+
+    def tell(self, owner: str, parameter: str, name: str = "") -> None:
+        """Tell the user what has been decided about the map, with the ``name`` of its file."""
+        for note in self.notes:
+            tell = warn if note.doubtful else inform
+            tell(f'{owner}: "{parameter}"' + (f' "{name}"' if name else "") + f": {note.text}")
 
     def doubt_of_green(self, orientation: int) -> str:
         """A sentence where the normals speak for green that points the other way; else empty.

@@ -11,7 +11,7 @@ pass is rendered again. So the image is the same in any case.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -229,7 +229,12 @@ def amounts(parts: dict[str, int]) -> list[str]:
     return [f"{size / 1e6:8.1f} MB  {name}" for name, size in notable.items()]
 
 
-def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Finding]:
+def inspect(
+    inspected: Inspected,
+    spp: int | None = None,
+    which: str = "",
+    report: Callable[[float], None] = lambda fraction: None,
+) -> list[Finding]:
     """Report the queries of each BSDF, its memory, and its memory with ``render --trim``.
 
     Args:
@@ -237,11 +242,15 @@ def inspect(inspected: Inspected, spp: int | None = None, which: str = "") -> li
         spp: samples per pixel of the rendering, on which footprints depend; None for the scene's
             own number.
         which: the sensor, see :func:`~.chosen_sensor`.
+        report: is called with the fraction done.
     """
     domains = survey(inspected, spp, which)
+    report(0.1)
     build_trimmed(inspected, domains)
+    report(0.3)
     trimmed = [bsdf.parts() for bsdf in inspected.bsdfs]
     build(inspected)
+    report(0.7)
     domains = survey(inspected, spp, which)  # once more, with the complete BSDFs
     return [
         Finding(

@@ -18,8 +18,10 @@ import mitsuba as mi
 
 from glintbsdf.scene.passes import Tile
 
-#: Smallest number of samples of a unit, if the image has as many.
+#: Smallest number of samples of a unit, if the image has as many. Smaller images have up to PASSES
+#: units with fewer samples, so that Ctrl-C can keep some of them, and the noise is known.
 FEWEST = 1 << 18
+PASSES = 8
 
 #: Largest number of samples of a unit. It bounds the memory for rendering a unit.
 MOST = 1 << 21
@@ -103,7 +105,9 @@ class Plan(Sequence[Unit]):
         """Number of passes; their numbers of samples differ by at most one."""
         if self.stratified:
             return 1
-        return max(1, min(self.spp, self.spp * self.film.pixels // FEWEST))
+        samples = self.spp * self.film.pixels
+        small = min(PASSES, 2 * PASSES * samples // FEWEST)
+        return max(1, min(self.spp, max(small, samples // FEWEST)))
 
     @cached_property
     def tiles(self) -> tuple[Tile, ...]:

@@ -50,6 +50,7 @@ from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
 from glintbsdf.pndf.manifold.mesh import frame_in_quad
 from glintbsdf.pndf.manifold.projected_area import mean_over_points
+from glintbsdf.pndf.sharing import shared
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Mahalanobis distance at which an element's normals are cut: 4.3e-4 of its mass lie outside. Only
@@ -571,21 +572,29 @@ class Elements(Mixture):
         self.levels = None
         self.lists = None
         if domain is None or not self.all_small(domain.largest):
-            arrays = self.cached(self.build_lists, self.sigma_r[0], self.step, self.curved)
-            self.lists = QuadLists(self.lattice, arrays)
+            key = self.sigma_r[0], self.step, self.curved
+
+            def make() -> QuadLists:
+                return QuadLists(self.lattice, self.cached(self.build_lists, *key))
+
+            self.lists = shared(self, make, "lists of elements", *key)
         self.slopes = self.make_slopes() if self.masked else None
 
     def make_slopes(self) -> MomentPyramid | None:
         if self.lists is None:
             return None
-        return MomentPyramid(
-            self.data,
-            self.wrap_mode,
-            lambda m: list(slope_of(m)),
-            spread=COVARIANCE,
-            first=FIRST_LEVEL,
-            domain=self.domain,
-        )
+
+        def make() -> MomentPyramid:
+            return MomentPyramid(
+                self.data,
+                self.wrap_mode,
+                lambda m: list(slope_of(m)),
+                spread=COVARIANCE,
+                first=FIRST_LEVEL,
+                domain=self.domain,
+            )
+
+        return shared(self, make, "slopes of elements", self.domain)
 
     def slope_moments(self, query, active):
         x, y, xx, yy, xy = self.slopes.average(query, active)

@@ -28,6 +28,7 @@ from glintbsdf.microfacet.mean_plane import mean_plane_area, visibility
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
+from glintbsdf.pndf.sharing import shared
 
 # ------------------------------------------------------------------------------------------------
 #  Moments: functions of projected normals, and products of deviations from the averages of these
@@ -244,15 +245,19 @@ class Filtered(PNDF):
             f"a map with slopes up to {MAX_SLOPE}",
             {"steeper": z_squared * (1 + MAX_SLOPE**2) < 1},
         )
-        self.pyramid = MomentPyramid(
-            self.data,
-            self.wrap_mode,
-            self.method.moments,
-            max_anisotropy=self.max_anisotropy,
-            domain=self.domain,
-            spread=self.method.spread,
-            between=self.method.between,
-        )
+
+        def make() -> MomentPyramid:
+            return MomentPyramid(
+                self.data,
+                self.wrap_mode,
+                self.method.moments,
+                max_anisotropy=self.max_anisotropy,
+                domain=self.domain,
+                spread=self.method.spread,
+                between=self.method.between,
+            )
+
+        self.pyramid = shared(self, make, self.name, self.max_anisotropy, self.domain)
 
     def check_alpha(self) -> None:
         """Raise :class:`~.ParameterError` unless the roughness is in the method's range."""

@@ -31,7 +31,9 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.memory import NOTABLE
 from glintbsdf.core.opaque import opaque
+from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
@@ -455,7 +457,7 @@ class MomentPyramid:
 
         def keep(level: list) -> None:
             k = len(stored)
-            stored.append(finish(cut_out(level, shapes[k], windows[k])))
+            stored.append(list(finish(cut_out(level, shapes[k], windows[k]))))
 
         if self.first == 0:
             keep(record_of(moments, spread, all_texels(normals, texels, axes_of(0))))
@@ -464,16 +466,21 @@ class MomentPyramid:
             over_quad = over_quad or partial(midpoint_rule, moments, spread)
             level, axes = quad_averages(over_quad, normals, texels)
         variance = 1 / 12  # of a quad or a texel, along each axis
-        for number in range(1, self.top + 1):
-            sigma, target = level_sigma(number), axes_of(number)
-            for along in (0, 1):
-                level = smooth(level, axes, along, target[along], sigma**2 - variance, spread)
-                axes = (target[0], axes[1]) if along == 0 else target
-                dr.eval(level)
-            variance = sigma**2
-            if number >= self.first:
-                keep(level)
-        self.store(stored, shapes, windows)
+        nbytes = 4 * len(level) * sum(map(samples, windows))
+        with progress("Averaging the map", nbytes) as report:
+            for number in range(1, self.top + 1):
+                sigma, target = level_sigma(number), axes_of(number)
+                for along in (0, 1):
+                    level = smooth(level, axes, along, target[along], sigma**2 - variance, spread)
+                    axes = (target[0], axes[1]) if along == 0 else target
+                    dr.eval(level)
+                variance = sigma**2
+                if number >= self.first:
+                    keep(level)
+                if nbytes >= NOTABLE:
+                    dr.sync_thread()
+                    report(number / self.top)
+            self.store(stored, shapes, windows)
 
     def choose_windows(
         self, shapes: list[tuple[SampleAxis, SampleAxis]], domain: Domain | None
@@ -521,6 +528,8 @@ class MomentPyramid:
         """
         channels = [dr.concat(parts) for parts in zip(*levels, strict=True)]
         dr.eval(channels)
+        for level in levels:  # a large map then never has three copies
+            level.clear()
         self.channels = len(channels)
         zero = dr.zeros(mi.Float, dr.width(channels[0]))
         self.records = []

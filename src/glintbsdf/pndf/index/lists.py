@@ -147,7 +147,9 @@ class Packed:
     def __init__(self, values: np.ndarray) -> None:
         self.half = values.dtype == np.uint16
         if self.half:
-            values = np.append(values, np.zeros(len(values) % 2, np.uint16)).view(np.uint32)
+            if len(values) % 2:
+                values = np.append(values, np.uint16(0))
+            values = values.view(np.uint32)
         self.words = stored(mi.UInt32, values)
         self.nbytes = values.nbytes
 
@@ -457,7 +459,8 @@ class Builder:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Build the arrays of :class:`QuadLists`."""
-        divisions = next(n for n in DIVISIONS if n == 1 or self.bytes_per_quad(n) <= self.allowed)
+        estimates = ((n, self.bytes_per_quad(n)) for n in DIVISIONS)
+        divisions, per_quad = next(e for e in estimates if e[0] == 1 or e[1] <= self.allowed)
         tables = self.use(divisions)
         cells = divisions**2
         index_type = np.uint16 if self.blocks.largest_entry < 1 << 16 else np.uint32
@@ -466,7 +469,8 @@ class Builder:
         total = np.zeros((self.rows, cells), np.int64)
         step = max(1, STRIP_COUNTERS // (cells * (self.columns + 1)))
         strips = [slice(k, min(k + step, self.rows)) for k in range(0, self.rows, step)]
-        with progress("Building lists of quads") as report:
+        items = self.rows * self.columns * self.blocks.mean_count
+        with progress("Building lists of quads", items * per_quad) as report:
             for done, strip in enumerate(strips):
                 counts = self.scan_strip(strip, np.zeros_like(offset[strip], np.uint32))
                 ends = np.cumsum(counts, axis=-1, dtype=np.uint32)

@@ -18,6 +18,7 @@ from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.filters.moments import MomentPyramid
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import ProjectedArea
+from glintbsdf.pndf.sharing import shared
 
 
 class FacetDiffuse:
@@ -93,12 +94,12 @@ class OrenNayarDiffuse:
 
     def parameters_changed(self) -> None:
         """Recompute the averages from the data of the mesh."""
-        self.pyramid = MomentPyramid(
-            self.mesh.data,
-            self.mesh.normal_map.wrap_mode,
-            slope_moments,
-            domain=self.domain,
-        )
+
+        def make() -> MomentPyramid:
+            wrap_mode = self.mesh.normal_map.wrap_mode
+            return MomentPyramid(self.mesh.data, wrap_mode, slope_moments, domain=self.domain)
+
+        self.pyramid = shared(self.mesh, make, "slopes of facets", self.domain)
 
     def eval(
         self,

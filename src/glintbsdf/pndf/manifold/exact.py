@@ -26,6 +26,7 @@ from glintbsdf.pndf.elements.elements import Elements
 from glintbsdf.pndf.index.lists import QuadLists, Window, every_quad
 from glintbsdf.pndf.manifold import projected_area
 from glintbsdf.pndf.manifold.mesh import TexelMesh, equilateral, quad_density
+from glintbsdf.pndf.sharing import shared
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
 #: Roughness σ_r of the elements that replace the manifold while the map carries derivatives. It is
@@ -95,14 +96,16 @@ class Manifold(TexelMesh, PNDF):
                 window,
             )
 
-        arrays = self.cached(build_lists, self.epsilon, window)
-        self.lists = QuadLists(self.lattice, arrays, window)
+        def make() -> QuadLists:
+            arrays = self.cached(build_lists, self.epsilon, window)
+            return QuadLists(self.lattice, arrays, window)
+
+        self.lists = shared(self, make, "lists of quads", self.epsilon, window)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check new data, and rebuild. Derivatives keep flowing to the data."""
         if keys and "data" not in keys:
             return
-        self.changed = True
         super().parameters_changed(keys)
         self.build(self.domain)
 

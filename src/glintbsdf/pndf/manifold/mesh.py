@@ -204,6 +204,9 @@ class TexelMesh:
         ParameterError: ``kernel`` or ``epsilon`` is not allowed.
     """
 
+    #: Whether ``data`` has been changed since the construction.
+    changed: bool = False
+
     def __init__(
         self,
         normal_map: NormalMap,
@@ -262,6 +265,7 @@ class TexelMesh:
         """Check new data, and use them. Derivatives keep flowing to the data."""
         if keys and "data" not in keys:
             return
+        self.changed = True
         self.normal_map = NormalMap(
             self.data.numpy(), wrap_mode=self.normal_map.wrap_mode, owner=self.owner
         )

@@ -71,6 +71,7 @@ from glintbsdf.pndf.manifold.mesh import (
     triangles_of_quad,
     where_needed,
 )
+from glintbsdf.pndf.sharing import shared
 
 #: A corner with |q| below this counts as being on the horizon: the product of two must not
 #: underflow.
@@ -756,14 +757,18 @@ class GgxFit(FootprintArea):
         self.pyramid, self.jumps = None, has_degenerate_triangles(self.mesh)
         if self.domain is not None and self.domain.most_quads <= self.few:
             return
-        self.pyramid = MomentPyramid(
-            self.mesh.data,
-            self.mesh.normal_map.wrap_mode,
-            None,
-            over_quad=partial(slopes_of_quad, epsilon=self.mesh.epsilon),
-            spread=COVARIANCE,
-            domain=self.domain,
-        )
+
+        def make() -> MomentPyramid:
+            return MomentPyramid(
+                self.mesh.data,
+                self.mesh.normal_map.wrap_mode,
+                None,
+                over_quad=partial(slopes_of_quad, epsilon=self.mesh.epsilon),
+                spread=COVARIANCE,
+                domain=self.domain,
+            )
+
+        self.pyramid = shared(self.mesh, make, "slopes of quads", self.mesh.epsilon, self.domain)
 
     def projected_areas(self, directions, query, active):
         kernel = self.mesh.texel_kernel(query)

@@ -1,0 +1,71 @@
+"""Materials that have one map have its structures in common, as long as the map stays as it is."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from glintbsdf import NormalMap, maps
+
+#: Plugins, and how to reach what is shared of each.
+STRUCTURES = {
+    "glint_manifold": lambda bsdf: (bsdf.pndf.lists, bsdf.masking.area.pyramid),
+    "glint_elements": lambda bsdf: (bsdf.pndf.lists, bsdf.pndf.slopes),
+    "glint_filtered": lambda bsdf: (bsdf.pndf.pyramid,),
+}
+
+
+@pytest.fixture
+def filename(tmp_path, variant) -> str:
+    normals = maps.isotropic(32, alpha=0.1, seed=5).normals
+    mi.Bitmap(normals.copy()).write(str(tmp_path / "map.exr"))
+    return str(tmp_path / "map.exr")
+
+
+@pytest.mark.parametrize("plugin", STRUCTURES)
+def test_two_materials_of_a_map(filename, plugin):
+    structures = STRUCTURES[plugin]
+    a, b, clamped = (
+        mi.load_dict({"type": plugin, "filename": filename, "material": material, **options})
+        for material, options in (("Au", {}), ("Cu", {}), ("Cu", {"wrap_mode": "clamp"}))
+    )
+    assert a.normal_map is b.normal_map is not clamped.normal_map
+    for of_a, of_b, other in zip(*map(structures, (a, b, clamped)), strict=True):
+        assert of_a is of_b is not other
+
+    # What changes one leaves the other as it is, and shares nothing from then on.
+    before = structures(b)
+    parameters = mi.traverse(a)
+    parameters["data"] = mi.TensorXf(0.5 * np.array(parameters["data"]))
+    parameters.update()
+    assert structures(b) == before
+    for of_a, of_b in zip(structures(a), structures(b), strict=True):
+        assert of_a is not of_b
+    parameters["data"] = mi.TensorXf(b.normal_map.normals)
+    dr.enable_grad(parameters["data"])
+    parameters.update()
+    for of_a, of_b in zip(structures(a), structures(b), strict=True):
+        assert of_a is not of_b
+
+
+def test_structures_go_with_their_last_material(filename):
+    a, b = (mi.load_dict({"type": "glint_filtered", "filename": filename}) for _ in range(2))
+    pyramid, normal_map = weakref.ref(a.pndf.pyramid), weakref.ref(a.normal_map)
+    del a
+    gc.collect()
+    assert pyramid() is b.pndf.pyramid and normal_map() is b.normal_map
+    del b
+    gc.collect()
+    assert pyramid() is None and normal_map() is None
+
+
+def test_a_file_that_has_changed_is_another_map(filename, variant):
+    first = NormalMap.load(filename)
+    assert NormalMap.load(filename) is first is not NormalMap.load(filename, strength=2.0)
+    mi.Bitmap(np.full((8, 8, 2), 0.1, np.float32)).write(filename)
+    assert NormalMap.load(filename).width == 8
