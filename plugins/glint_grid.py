@@ -141,7 +141,7 @@ from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.pndf import Grid
-from glintbsdf.pndf.grid.microdetails import Palette, Wheel
+from glintbsdf.pndf.colors import Palette, Wheel
 
 
 class GlintGrid(GlintBSDF):

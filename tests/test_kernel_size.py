@@ -60,7 +60,7 @@ def outgoing() -> mi.Vector3f:
 
 
 def make(plugin: str, **parameters) -> mi.BSDF:
-    if plugin != "glint_grid":
+    if plugin not in ("glint_grid", "glint_particles"):
         parameters["data"] = mi.TensorXf(MAP.normals)
     return mi.load_dict({"type": plugin, **parameters})
 
@@ -114,6 +114,19 @@ FEATURES = [
         {},
         {"colors": "none", "light_spread": 0.0, "pixel_spread": 0.0},
         {"colors": "wheel", "material": "Au", "specular_reflectance": 0.5, "pixel_spread": 1e-3},
+    ),
+    (
+        "glint_particles",
+        {"masking": "none"},
+        {"colors": "none", "space": "uv", "pixel_spread": 0.0},
+        {
+            "colors": "wheel",
+            "space": "object",
+            "masking": "ggx",
+            "material": "Au",
+            "specular_reflectance": 0.5,
+            "pixel_spread": 1e-3,
+        },
     ),
     (
         "glint_diffuse",

@@ -21,6 +21,12 @@ WITH_MAP = {
 WITHOUT_MAP = {
     "flakes": {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08},
     "grid": {"type": "glint_grid", "alpha": 0.2, "density": 6.0},
+    "particles": {
+        "type": "glint_particles",
+        "alpha": 0.2,
+        "micro_alpha": 0.05,
+        "density": 4.0,
+    },
 }
 KEYS = [
     ("elements", "sigma_r", 64),
@@ -39,6 +45,9 @@ KEYS = [
     ("flakes", "sigma_r", 64),
     ("flakes", "flake_alpha", 64),
     ("grid", "alpha_u", 64),
+    ("particles", "alpha_u", 64),
+    ("particles", "alpha_v", 64),
+    ("particles", "micro_alpha", 64),
 ]
 
 

@@ -22,7 +22,7 @@ from glintbsdf.core.errors import ParameterError, check
 from glintbsdf.core.messages import warn
 from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
-from glintbsdf.footprint.query import Query
+from glintbsdf.footprint.query import Place, Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap
 from glintbsdf.microfacet.interface import Component, Mirror
 from glintbsdf.microfacet.masking import SmithMasking
@@ -188,17 +188,24 @@ class FootprintBSDF(mi.BSDF):
         """Check, once, whether the shapes with this BSDF fit its map.
 
         Raises:
-            ParameterError: a mesh without UV coordinates.
+            ParameterError: a shape lacks what :meth:`require_of_surfaces` asks for.
         """
         if self.looked_at_surfaces:
             return
         self.looked_at_surfaces = True
-        shapes = shapes_of(self)
-        require_uvs(self.owner, shapes)
+        self.require_of_surfaces()
         if self.normal_map is None or self.green_is_given:
             return
-        if doubt := doubt_of_green(self.normal_map, self.to_uv, shapes):
+        if doubt := doubt_of_green(self.normal_map, self.to_uv, shapes_of(self)):
             warn(f'{self.owner} "{self.name}": {doubt}')
+
+    def require_of_surfaces(self) -> None:
+        """Refuse shapes on which this BSDF cannot be, by default meshes without UV coordinates."""
+        require_uvs(self.owner, shapes_of(self))
+
+    def place(self, si: mi.SurfaceInteraction3f) -> Place | None:
+        """Where ``si`` is in space, for a P-NDF that is placed there; by default None."""
+        return None
 
     def slope_frame(self, si: mi.SurfaceInteraction3f) -> SlopeFrame | None:
         """The frame of a height map's slopes on the surface at ``si``; None for a map of normals,
@@ -224,13 +231,15 @@ class FootprintBSDF(mi.BSDF):
         """
         self.traverse(RefusesDerivatives(self.owner))
         footprint, parameters = self.footprint(si, active), self.parameters_at(si, mi.Bool(active))
+        place = self.place(si)
         carried = Carried.of(si) if self.integrates_lights and wo is not None else None
         if carried is None:
-            return Query(footprint, parameters=parameters)
+            return Query(footprint, parameters=parameters, place=place)
         # Per UV of the map: H times the inverse of the linear part of to_uv.
         to_uv = mi.AffineTransform3f(self.to_uv).matrix
         inverse = dr.rcp(mi.Matrix2f([[to_uv[0, 0], to_uv[0, 1]], [to_uv[1, 0], to_uv[1, 1]]]))
-        return Query(footprint, carried.turn(si) @ inverse, carried.spread(wi, wo), parameters)
+        turn, spread = carried.turn(si) @ inverse, carried.spread(wi, wo)
+        return Query(footprint, turn, spread, parameters, place)
 
     def parameters_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Mapping[str, mi.Float]:
         """The values of :attr:`textures` at ``si``, by name, clipped to the parameter's range."""
@@ -368,7 +377,7 @@ class GlintBSDF(FootprintBSDF):
         self.smooth = self.pndf.smooth()
         self.smooth_masking = None
         if self.smooth is not None:
-            self.smooth_masking = self.smooth.masking("beckmann", False)
+            self.smooth_masking = self.smooth.masking(self.smooth.maskings[0], False)
         self.color_conversion = None if self.pndf.colors is None else ColorConversion()
 
     def traverse(self, callback: mi.TraversalCallback) -> None:

@@ -186,6 +186,24 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         "max_anisotropy": Number(1, 1024),
         "seed": _SEED,
     },
+    "glint_particles": {
+        **_FOOTPRINT,
+        **_MATERIAL,
+        "distribution": NAME,
+        **{f"alpha{axis}": _ROUGHNESS for axis in ("", "_u", "_v")},
+        "micro_alpha": Number(0, 10, above=True),
+        "density": Number(-8, 16),
+        "colors": COLORS,
+        "color": SPECTRUM,
+        "hue_variation": Number(0, 0.5),
+        "saturation_variation": Number(0, 1),
+        "value_variation": Number(0, 1),
+        "space": NAME,
+        "to_object": TRANSFORM,
+        "masking": NAME,
+        "height_correlated": FLAG,
+        "seed": _SEED,
+    },
     "glint_path": {
         "max_depth": Number(-1, 2**31 - 1, whole=True),
         "rr_depth": Number(1, 2**31 - 1, whole=True),
@@ -391,18 +409,33 @@ class Parameters:
         )
         return NormalMap.from_array(value, **options)
 
+    def given_transform(self, name: str) -> mi.ScalarAffineTransform4f:
+        """A transform as it was given, the identity where it was not."""
+        value = self.props.get(name, mi.ScalarAffineTransform4f())
+        right = name not in self.props or self.props.type(name) == mi.Properties.Type.Transform
+        check(right, self.owner, name, "a transform", value)
+        return value
+
+    def transform(self, name: str) -> mi.ScalarAffineTransform4f:
+        """A transform of space, which must be finite and invertible."""
+        value = mi.ScalarAffineTransform4f(self.given_transform(name).matrix)
+        check_transform(self.owner, name, value)
+        return value
+
+    def color(self, name: str) -> tuple[float, ...]:
+        """A colour of linear RGB in [0, 1], or a number for grey."""
+        value, kind = self.props[name], self.props.type(name)
+        numeric = {mi.Properties.Type.Float, mi.Properties.Type.Integer}
+        numbers: list = [value] * 3 if kind in numeric else []
+        if kind == mi.Properties.Type.Color:
+            numbers = list(value)  # type: ignore[call-overload]
+        right = len(numbers) > 0 and all(0 <= x <= 1 for x in numbers)
+        check(right, self.owner, name, "a colour of numbers from 0 to 1", value)
+        return tuple(float(x) for x in numbers)
+
     def to_uv(self) -> mi.ScalarAffineTransform3f:
         """The transform of UV space. It must be finite and its linear part invertible."""
-        value = self.props.get("to_uv", mi.ScalarAffineTransform4f())
-        check(
-            self.props.type("to_uv") == mi.Properties.Type.Transform
-            if "to_uv" in self.props
-            else True,
-            self.owner,
-            "to_uv",
-            "a transform",
-            value,
-        )
+        value = self.given_transform("to_uv")
         to_uv = mi.ScalarAffineTransform3f(value.extract().matrix)  # type: ignore[attr-defined]
         check_to_uv(self.owner, to_uv)
         return to_uv
@@ -554,4 +587,16 @@ def check_to_uv(owner: str, to_uv: mi.ScalarAffineTransform3f) -> None:
         "to_uv",
         "a finite, invertible transform of the UV plane",
         entries,
+    )
+
+
+def check_transform(owner: str, name: str, transform: mi.ScalarAffineTransform4f) -> None:
+    """Refuse a transform of space that is not finite or not invertible."""
+    matrix = np.array(transform.matrix, np.float64)
+    check(
+        np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0,
+        owner,
+        name,
+        "a finite, invertible transform",
+        matrix.tolist(),
     )

@@ -102,6 +102,21 @@ def require_uvs(owner: str, shapes: list[mi.Shape]) -> None:
             )
 
 
+def require_tangents(owner: str, shapes: list[mi.Shape]) -> None:
+    """Refuse curves under a BSDF whose footprints lie in space: they have no tangents across them.
+
+    Raises:
+        ParameterError: names the plugin and the shape, and says what to do.
+    """
+    for shape in shapes:
+        if shape.shape_type() in (+mi.ShapeType.BSplineCurve, +mi.ShapeType.LinearCurve):
+            raise ParameterError(
+                f'{owner}: "space" must be uv on "{shape.id() or shape.class_name()}", a curve, '
+                "whose surface has no frame of tangents (got object): use a mesh, or a shape of "
+                "Mitsuba that has a surface"
+            )
+
+
 def uv_orientation(shape: mi.Shape) -> int:
     """1 if u, v and the normal of a surface are right-handed, −1 if they are left-handed, else 0.
 

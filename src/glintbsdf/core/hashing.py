@@ -30,6 +30,23 @@ def pcg3d(x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> tuple[mi.UInt32, mi.UInt3
     return x, y, z
 
 
+def pcg(x: mi.UInt32) -> mi.UInt32:
+    """A hashed integer of one, for numbers that are many and need be no better than this.
+
+    The output permutation of PCG (RXS M XS) after one congruential step, a bijection (Jarzynski and
+    Olano 2020, ``pcg``).
+    """
+    x = mi.UInt32(x) * 747796405 + 2891336453
+    x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737
+    return (x >> 22) ^ x
+
+
+def uniform_pair(bits: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    """Two numbers in (0, 1) from one integer: centres of 2¹⁶ equal intervals."""
+    halves = bits & 0xFFFF, bits >> 16
+    return tuple(dr.fma(mi.Float(half), 2.0**-16, 2.0**-17) for half in halves)
+
+
 def uniform(bits: mi.UInt32) -> mi.Float:
     """A number in (0, 1) from an integer: the centre of one of 2²³ equal intervals, exactly.
 

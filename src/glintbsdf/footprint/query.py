@@ -17,14 +17,37 @@ around s₀. The P-NDF is averaged over a Gaussian of this covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
 from typing import TypeVar
 
 import mitsuba as mi
 
-from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.gaussian import Footprint, tangent_to_uv
 from glintbsdf.footprint.kernels import SIGMA_MIN, TexelKernel
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a query is in space, for methods that need no UV coordinates.
+
+    Attributes:
+        position (mi.Point3f): the centre of the footprint.
+        dp_du, dp_dv (mi.Vector3f): change of the position per unit of u and of v.
+    """
+
+    position: mi.Point3f
+    dp_du: mi.Vector3f
+    dp_dv: mi.Vector3f
+
+    def tangent(self, v: mi.Vector2f) -> mi.Vector3f:
+        """A vector of the UV plane, on the surface."""
+        return self.dp_du * v.x + self.dp_dv * v.y
+
+    def in_uv(self, offset: mi.Vector3f) -> mi.Vector2f:
+        """The vector of the UV plane that is nearest to ``offset`` on the surface."""
+        return tangent_to_uv(self.dp_du, self.dp_dv, offset)
 
 
 class Query:
@@ -38,6 +61,7 @@ class Query:
             projected normals over which D is averaged; none for no average.
         parameters: values, by name, of the P-NDF's parameters that have a
             texture, at the surface point.
+        place (Place): position of the footprint in space; None if no method needs it.
     """
 
     def __init__(
@@ -46,9 +70,10 @@ class Query:
         turn: mi.Matrix2f | None = None,
         spread: tuple[mi.Vector2f, ...] = (),
         parameters: Mapping[str, mi.Float] | None = None,
+        place: Place | None = None,
     ) -> None:
         self.footprint, self.turn, self.spread = footprint, turn, tuple(spread)
-        self.parameters = dict(parameters or {})
+        self.parameters, self.place = dict(parameters or {}), place
         self._derived: dict[Hashable, object] = {}
 
     @staticmethod
@@ -58,7 +83,7 @@ class Query:
 
     def at(self, footprint: Footprint) -> Query:
         """The same query with another footprint."""
-        return Query(footprint, self.turn, self.spread, self.parameters)
+        return Query(footprint, self.turn, self.spread, self.parameters, self.place)
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """The result of ``make()``, which is called on first use only.

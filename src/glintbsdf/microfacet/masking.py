@@ -63,8 +63,10 @@ class SmithMasking:
         """Rebuild what depends on the parameters named; on any of them where none is named."""
 
 
-class BeckmannMasking(SmithMasking):
-    """Masking of a Beckmann surface.
+class DistributionMasking(SmithMasking):
+    """Masking of a surface whose facets all together have a roughness.
+
+    A subclass says which distribution they have.
 
     Args:
         alpha_squared: function that returns an ``mi.Vector2f``, squared roughness along u and v. It
@@ -78,8 +80,7 @@ class BeckmannMasking(SmithMasking):
         self.current, self.keys = alpha_squared, frozenset(keys)
         self.alpha_squared = alpha_squared()
 
-    def smith_lambda(self, w, query, active):
-        return beckmann_lambda(w, self.alpha_squared)
+    name: str
 
     def parameters_changed(self, keys=()):
         if not keys or self.keys & set(keys):
@@ -88,9 +89,27 @@ class BeckmannMasking(SmithMasking):
     def __repr__(self) -> str:
         alpha_u, alpha_v = (sqrt(x[0]) for x in self.alpha_squared)
         return (
-            f"beckmann[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
+            f"{self.name}[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}, "
             f"height_correlated = {self.height_correlated}]"
         )
+
+
+class BeckmannMasking(DistributionMasking):
+    """Masking of a Beckmann surface."""
+
+    name = "beckmann"
+
+    def smith_lambda(self, w, query, active):
+        return beckmann_lambda(w, self.alpha_squared)
+
+
+class GGXMasking(DistributionMasking):
+    """Masking of a GGX surface."""
+
+    name = "ggx"
+
+    def smith_lambda(self, w, query, active):
+        return ggx_lambda(w, self.alpha_squared)
 
 
 class MeanPlaneMasking(SmithMasking):
@@ -137,3 +156,10 @@ def beckmann_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:
     value = 0.5 * (dr.exp(-a * a) / (a * sqrt(pi)) - (1 - dr.erf(a)))
     # The two terms cancel as a grows; rounding must not turn G into more than 1.
     return dr.select(visible, dr.maximum(value, 0), 0)
+
+
+def ggx_lambda(w: mi.Vector3f, alpha_squared: mi.Vector2f) -> mi.Float:
+    """Λ(w) = (√(1 + (α_u² w_x² + α_v² w_y²)/w_z²) − 1)/2 of a GGX surface (Heitz 2014)."""
+    tangent_squared = alpha_squared.x * w.x * w.x + alpha_squared.y * w.y * w.y
+    t = tangent_squared / dr.square(dr.maximum(w.z, 1e-6))
+    return 0.5 * t / (1 + dr.sqrt(1 + t))  # without cancellation

@@ -10,6 +10,7 @@ from glintbsdf.pndf.manifold.clustered import ClusteredManifold
 from glintbsdf.pndf.manifold.exact import Manifold
 from glintbsdf.pndf.manifold.tabulated import TabulatedManifold
 from glintbsdf.pndf.mip.mip import Mip
+from glintbsdf.pndf.particles.particles import Particles
 
 __all__ = [
     "ClusteredManifold",
@@ -20,6 +21,7 @@ __all__ = [
     "HandOver",
     "Manifold",
     "Mip",
+    "Particles",
     "TabulatedManifold",
     "PNDF",
     "methods",

@@ -32,7 +32,7 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet.frame import normal_from_projection
-from glintbsdf.microfacet.masking import BeckmannMasking, MeanPlaneMasking, SmithMasking
+from glintbsdf.microfacet.masking import BeckmannMasking, GGXMasking, MeanPlaneMasking, SmithMasking
 
 
 class Colors(Protocol):
@@ -219,13 +219,15 @@ class PNDF(ABC):
         """Masking and shadowing by one of :attr:`maskings`; None for ``none``.
 
         ``footprint`` is the masking of the facets under the footprint over their mean plane, by
-        :meth:`projected_areas`; ``beckmann`` that of a Beckmann surface as rough as all normals
-        together.
+        :meth:`projected_areas`; ``beckmann`` and ``ggx`` are those of a surface of this
+        distribution, as rough as all normals together.
         """
         if name == "footprint":
             return MeanPlaneMasking(self, height_correlated)
         if name == "beckmann":
             return BeckmannMasking(self.alpha_squared, height_correlated, self.roughness_keys)
+        if name == "ggx":
+            return GGXMasking(self.alpha_squared, height_correlated, self.roughness_keys)
         if name == "none":
             return None
         raise NotImplementedError(f"{type(self).__name__} has no masking {name}")

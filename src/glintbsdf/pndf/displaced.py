@@ -92,6 +92,6 @@ def in_map(query: Query, frame: SlopeFrame) -> Query:
     def make() -> Query:
         turn = None if query.turn is None else frame.inverse @ query.turn
         spread = tuple(frame.inverse @ vector for vector in query.spread)
-        return Query(query.footprint, turn, spread, query.parameters)
+        return Query(query.footprint, turn, spread, query.parameters, query.place)
 
     return query.once("displaced", make)

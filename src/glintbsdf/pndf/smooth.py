@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from glintbsdf.footprint.query import Query
 from glintbsdf.microfacet.frame import normal_from_projection
-from glintbsdf.microfacet.masking import BeckmannMasking, SmithMasking
 from glintbsdf.pndf.base import PNDF
 
 #: The smallest roughness that Mitsuba's Beckmann distribution can have.
@@ -25,38 +24,40 @@ def smooth_alpha(alpha_squared: mi.Vector2f, sigma_r: float | mi.Float = 0.0) ->
     return dr.sqrt(dr.maximum(alpha_squared + 2 * dr.square(sigma_r), MIN_ALPHA**2))
 
 
-class SmoothBeckmann(PNDF):
-    """The facets of a smooth Beckmann surface, as ``roughconductor`` has them, for any footprint.
+class SmoothSurface(PNDF):
+    """The facets of a smooth surface, as ``roughconductor`` has them, for any footprint.
 
     Visible normals, masking and shadowing are separable, as in that plugin of Mitsuba.
 
     Args:
         alpha: function that returns an ``mi.Vector2f``, the roughness along u and v, at least 1e-4.
         keys: names of the parameters on which the roughness depends.
+        distribution (str): ``beckmann`` or ``ggx``.
     """
 
     def __init__(
         self,
         alpha: Callable[[], mi.Vector2f],
         keys: Iterable[str] = ("data",),
-        owner: str = "SmoothBeckmann",
+        owner: str = "SmoothSurface",
+        distribution: str = "beckmann",
     ) -> None:
-        self.owner = owner
+        self.owner, self.name = owner, distribution
+        self.maskings = (distribution, "none")  # type: ignore[misc]
         self.current, self.keys = alpha, frozenset(keys)
+        self.roughness_keys = tuple(keys)  # type: ignore[misc]
         self.derive()
 
     def derive(self) -> None:
         """Take up the roughness."""
         self.alpha = self.current()
+        kind = {"beckmann": mi.MicrofacetType.Beckmann, "ggx": mi.MicrofacetType.GGX}[self.name]
         self.distribution = mi.MicrofacetDistribution(
-            mi.MicrofacetType.Beckmann, self.alpha.x, self.alpha.y, sample_visible=True
+            kind, self.alpha.x, self.alpha.y, sample_visible=True
         )
 
     def alpha_squared(self) -> mi.Vector2f:
         return dr.square(self.alpha)
-
-    def masking(self, name: str = "beckmann", height_correlated: bool = False) -> SmithMasking:
-        return BeckmannMasking(self.alpha_squared, height_correlated, self.keys)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not keys or self.keys & set(keys):
@@ -69,6 +70,7 @@ class SmoothBeckmann(PNDF):
         return self.distribution.eval(normal_from_projection(m))
 
     def _sample(self, query, sample1, sample2, active):
+        # From straight above, all facets are seen in proportion to their projections.
         return mi.Vector3f(self.distribution.sample(mi.Vector3f(0, 0, 1), sample2)[0]).xy
 
     def sample_visible(self, wi, query, sample1, sample2, active):
@@ -79,4 +81,9 @@ class SmoothBeckmann(PNDF):
         return self.distribution.pdf(wi, m)
 
     def __repr__(self) -> str:
-        return f"SmoothBeckmann[alpha_u = {self.alpha.x[0]:.4g}, alpha_v = {self.alpha.y[0]:.4g}]"
+        alpha_u, alpha_v = (x[0] for x in self.alpha)
+        return f"{type(self).__name__}[alpha_u = {alpha_u:.4g}, alpha_v = {alpha_v:.4g}]"
+
+
+class SmoothBeckmann(SmoothSurface):
+    """The facets of a smooth Beckmann surface."""

@@ -23,7 +23,6 @@ import mitsuba as mi
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import coherent_vertex, gaussian, pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.gaussian import is_literal_zero
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
@@ -311,45 +310,6 @@ class ReflectingCount:
         count = mean + dr.sqrt(mean * (1 - self.p)) * x
         count = count + (1 - 2 * self.p) / 6 * (x * x - 1)
         return dr.clip(count, 0, n)
-
-
-# ------------------------------------------------------------------------------------------------
-#  Section 4.5: colours
-# ------------------------------------------------------------------------------------------------
-
-
-class Wheel:
-    """Fully saturated colours of all hues, with components up to 2, so that their mean is white."""
-
-    mean = (1.0, 1.0, 1.0)
-
-    def pick(self, u: mi.Float) -> mi.Color3f:
-        """The colour at the fraction ``u``, in [0, 1), of the way around the wheel."""
-        hue = [6 * dr.abs(u - dr.floor(u + 0.5 - k / 3) - k / 3) for k in range(3)]
-        return mi.Color3f([2 * dr.clip(2 - h, 0, 1) for h in hue])
-
-    def __repr__(self) -> str:
-        return "wheel"
-
-
-class Palette:
-    """The colours of an image, each as likely as any other.
-
-    Args:
-        colors: linear RGB values, an array N×3 (NumPy, float32).
-    """
-
-    def __init__(self, colors) -> None:
-        self.count = len(colors)
-        self.mean = tuple(float(x) for x in colors.mean(0))
-        self.colors = stored(mi.Float, colors.ravel())
-
-    def pick(self, u: mi.Float) -> mi.Color3f:
-        """The colour at the fraction ``u``, in [0, 1), of the way through the image."""
-        return dr.gather(mi.Color3f, self.colors, mi.UInt32(u * self.count))
-
-    def __repr__(self) -> str:
-        return f"palette of {self.count}"
 
 
 # ------------------------------------------------------------------------------------------------
