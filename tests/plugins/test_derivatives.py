@@ -45,9 +45,9 @@ KEYS = [
     ("flakes", "sigma_r", 64),
     ("flakes", "flake_alpha", 64),
     ("grid", "alpha_u", 64),
-    ("particles", "alpha_u", 64),
-    ("particles", "alpha_v", 64),
-    ("particles", "micro_alpha", 64),
+    ("particles", "alpha_u", 256),
+    ("particles", "alpha_v", 256),
+    ("particles", "micro_alpha", 256),
 ]
 
 

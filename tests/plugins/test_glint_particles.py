@@ -144,8 +144,9 @@ def test_extreme_parameters(variant, density, micro_alpha):
 
 def test_furnace_from_above(variant):
     above = replace(RESOLVED, wi=(0, 0, 1))
-    for parameters in SURFACES.values():
-        suite.check_furnace(load(**parameters), above, View())
+    for name, parameters in SURFACES.items():
+        if name != "wheel":  # whose colours are up to twice as bright as white
+            suite.check_furnace(load(**parameters), above, View())
 
 
 @pytest.mark.parametrize("key", ["alpha_u", "alpha_v", "micro_alpha", "specular_reflectance.value"])
@@ -235,13 +236,15 @@ def test_facets_in_space_do_not_depend_on_uvs(variant):
 
 
 def test_facets_move_with_the_object(variant):
-    to_world = mi.ScalarTransform4f().translate([3, 1, -2]).rotate([1, 1, 0], 40)
+    to_world = mi.ScalarTransform4f().translate([3, 1, -2]).rotate([0.6, 0.8, 0], 40)
     wo = dr.normalize(mi.Vector3f(0.1, -0.2, 1))
     u = suite.random_numbers(1000, 2, 3)
     si = replace(RESOLVED).interaction(1000)
     si.p = mi.Point3f(u[0], u[1], 0)
     still = np.array(load(space="object", density=6.0).eval(mi.BSDFContext(), si, wo)[0])
-    si.p, si.dp_du, si.dp_dv = (to_world @ x for x in (si.p, si.dp_du, si.dp_dv))
+    si.p, si.dp_du, si.dp_dv = (
+        mi.AffineTransform4f(to_world) @ x for x in (si.p, si.dp_du, si.dp_dv)
+    )
     moved = load(space="object", density=6.0, to_object=to_world.inverse())
     assert np.allclose(
         np.array(moved.eval(mi.BSDFContext(), si, wo)[0]), still, rtol=0.02, atol=0.02
@@ -258,8 +261,18 @@ def test_a_mesh_without_uvs(variant, tmp_path):
     mesh.write_ply(file)
     image = picture({"type": "ply", "filename": file, "bsdf": describe(space="object")})
     assert image.std() > 0.1 * image.mean()
-    with pytest.raises(Exception, match="has no UV coordinates"):
-        picture({"type": "ply", "filename": file, "bsdf": describe()})
+    said = refused({"type": "ply", "filename": file, "bsdf": describe()})
+    assert "has no UV coordinates" in said
+
+
+def refused(shape: dict) -> str:
+    """All that is said where a shape is refused: Dr.Jit wraps the error."""
+    with pytest.raises(Exception) as caught:  # noqa: PT011
+        picture(shape)
+    told, error = "", caught.value
+    while error is not None:
+        told, error = told + str(error), error.__cause__ or error.__context__
+    return told
 
 
 def picture(shape: dict) -> np.ndarray:
@@ -283,8 +296,8 @@ def picture(shape: dict) -> np.ndarray:
 def test_curves_have_no_frame(variant, tmp_path):
     (tmp_path / "hair.txt").write_text("0 0 0 0.1\n0 1 0 0.1\n0 2 0 0.1\n0 3 0 0.1\n")
     curve = {"type": "bsplinecurve", "filename": str(tmp_path / "hair.txt")}
-    with pytest.raises(Exception, match='glint_particles: "space" must be uv on .* a curve'):
-        picture({**curve, "bsdf": describe(space="object")})
+    said = refused({**curve, "bsdf": describe(space="object")})
+    assert 'glint_particles: "space" must be uv on ' in said and ", a curve, " in said
 
 
 # --------------------------------------------------------------------------------------------------
