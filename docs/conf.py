@@ -15,7 +15,7 @@ release = glintbsdf.__version__
 
 extensions = [
     "plugin_pages",
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx-mathjax-offline",  # mathematics without a network
@@ -25,13 +25,18 @@ extensions = [
     "sphinxcontrib.bibtex",
 ]
 bibtex_bibfiles = ["references.bib"]
+# Tutorials run when the site is built. An error in one is an error of the build.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600
+nb_merge_streams = True
 suppress_warnings = ["myst.header"]  # what is included of the README begins at its second level
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 copybutton_exclude = ".linenos, .gp"
 sphinx_tabs_disable_tab_closing = True
-exclude_patterns = ["_build", "images/README.md"]
+exclude_patterns = ["_build", "jupyter_execute", "images/README.md"]
 
 html_theme = "furo"
 html_title = f"glintbsdf {release}"

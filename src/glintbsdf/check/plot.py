@@ -1,6 +1,7 @@
 """Figures: a P-NDF beside its reference, a footprint on its map, error over time.
 
-Every function returns a matplotlib figure, which a notebook shows and ``figure.savefig`` writes.
+Every function returns a matplotlib figure. ``figure.savefig`` writes it, and a notebook shows it
+after ``%matplotlib inline``.
 """
 
 from __future__ import annotations
