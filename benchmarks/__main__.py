@@ -39,7 +39,21 @@ class Benchmarks(click.Group):
         return getattr(import_module(f"benchmarks.commands.{name}"), name)
 
 
+def add(_context: click.Context, _option: click.Parameter, modules: tuple[str, ...]) -> None:
+    """Import plugins before a command is imported, which takes its methods from the register."""
+    if modules:
+        import mitsuba as mi
+
+        from glintbsdf.bridge import registration
+
+        mi.set_variant("llvm_ad_rgb")
+        for module in modules:
+            registration.add_plugins(module)
+
+
 @click.group(cls=Benchmarks, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--method", multiple=True, metavar="MODULE", callback=add, expose_value=False,
+              help="Module with a P-NDF of your own, which is compared as well.")  # fmt: skip
 def benchmarks() -> None:
     """Measure glintbsdf. Each command prints tables; its help says what was expected.
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import pytest
 
 from glintbsdf.bridge import registration
+from glintbsdf.pndf import base
 
 
 def a_plugin() -> dict:
@@ -103,3 +106,41 @@ def test_base_classes_by_their_public_name_are_those_of_the_active_variant(varia
     assert isinstance(made, bsdf.GlintBSDF) and isinstance(made, bsdf.FootprintBSDF)
     with pytest.raises(AttributeError, match="nothing"):
         _ = bsdf.nothing
+
+
+WAVES = Path(__file__).parents[2] / "docs" / "examples"
+
+
+@pytest.fixture
+def waves(variant, monkeypatch):
+    """The module of the page "Write your own P-NDF", which Python finds; later nobody knows it."""
+    monkeypatch.syspath_prepend(WAVES)
+    yield "waves"
+    registration._added.clear()
+    sys.modules.pop("waves", None)
+    base._methods.pop("waves", None)
+
+
+def test_plugins_of_others_survive_changes_of_variant(waves, variant):
+    registration.add_plugins(waves)
+    for name in (variant, variant.replace("rgb", "mono"), "scalar_rgb", variant):
+        mi.set_variant(name)
+        if not name.startswith("scalar"):
+            assert isinstance(mi.load_dict({"type": "glint_waves"}), mi.BSDF)
+    assert base.methods()["waves"].plugin == "glint_waves"
+
+
+def test_entry_points_are_plugins(waves, variant, monkeypatch):
+    entry = EntryPoint("waves", "waves", registration.GROUP)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [entry])
+    mi.set_variant("scalar_rgb")
+    mi.set_variant(variant)
+    assert isinstance(mi.load_dict({"type": "glint_waves"}), mi.BSDF)
+
+
+def test_a_module_that_is_not_there(variant):
+    for name in (variant, "scalar_rgb"):
+        mi.set_variant(name)
+        with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+            registration.add_plugins("no_such_module")
+    assert "no_such_module" not in registration.modules_of_others()

@@ -8,6 +8,7 @@ Mitsuba's types up when they are called and need no reloading.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
 import sys
 from collections.abc import Callable
@@ -20,6 +21,11 @@ from glintbsdf.core.errors import ParameterError
 _PLUGINS = "glintbsdf.plugins"
 _BASE_CLASS = "glintbsdf.bridge.bsdf"
 _INTEGRATORS = ("glint_path",)  # all other plugins are BSDFs
+
+#: Entry points of this group name modules of other packages with plugins of their own.
+GROUP = "glintbsdf.plugins"
+
+_added: list[str] = []
 
 
 class VariantError(RuntimeError):
@@ -63,6 +69,40 @@ def plugin_types() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
 
 
+def add_plugins(module: str) -> None:
+    """Import a module with plugins of your own, now and in every variant chosen later.
+
+    The module must be importable by its name. Packages have an entry point of :data:`GROUP`
+    instead.
+
+    Raises:
+        ImportError: there is no such module, or it cannot be imported.
+    """
+    variant = mi.variant()
+    if variant is not None and not variant.startswith("scalar"):
+        _load(module)
+    elif importlib.util.find_spec(module) is None:
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+    if module not in _added:
+        _added.append(module)
+
+
+def modules_of_others() -> list[str]:
+    """Modules of other packages with plugins: by entry points, and by :func:`add_plugins`."""
+    from importlib.metadata import entry_points
+
+    named = [entry.module for entry in entry_points(group=GROUP)]
+    return list(dict.fromkeys([*named, *_added]))
+
+
+def _load(module: str) -> None:
+    """Import a module, or import it anew for the classes of the active variant."""
+    if module in sys.modules:
+        importlib.reload(sys.modules[module])
+    else:
+        importlib.import_module(module)
+
+
 def install() -> None:
     """Register the plugins in the active variant, if any, and in every one chosen later.
 
@@ -91,11 +131,9 @@ def register(variant: str) -> None:
 
     if variant.startswith("llvm"):
         llvm.require_usable()
-    for module in (_BASE_CLASS, *(f"{_PLUGINS}.{plugin_type}" for plugin_type in plugin_types())):
-        if module in sys.modules:
-            importlib.reload(sys.modules[module])
-        else:
-            importlib.import_module(module)
+    own = (f"{_PLUGINS}.{plugin_type}" for plugin_type in plugin_types())
+    for module in (_BASE_CLASS, *own, *modules_of_others()):
+        _load(module)
 
 
 def _on_variant_change(_old: str | None, new: str) -> None:
