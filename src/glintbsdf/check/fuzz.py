@@ -201,7 +201,7 @@ def base(plugin: str) -> dict:
     from glintbsdf.maps import isotropic
 
     description: dict = {"type": plugin}
-    if plugin not in ("glint_grid", "glint_path"):
+    if plugin not in ("glint_grid", "glint_particles", "glint_path"):
         size = 16 if plugin == "glint_mip" else 8
         description["data"] = mi.TensorXf(isotropic(size, alpha=0.2).normals)
     if plugin == "glint_mip":
