@@ -150,6 +150,7 @@ import mitsuba as mi
 
 from glintbsdf.bridge.bsdf import GlintBSDF
 from glintbsdf.bridge.parameters import Parameters
+from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.bridge.surfaces import require_tangents, require_uvs, shapes_of
 from glintbsdf.core.errors import check
 from glintbsdf.footprint.domain import Domain
@@ -219,4 +220,4 @@ class GlintParticles(GlintBSDF):
             callback.put("to_object", self.to_object, mi.ParamFlags.NonDifferentiable)
 
 
-mi.register_bsdf("glint_particles", lambda props: GlintParticles(props))
+register_plugin("glint_particles", GlintParticles)
