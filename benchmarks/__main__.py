@@ -24,6 +24,7 @@ COMMANDS = (
     "mip",
     "grid",
     "separation",
+    "inverse",
 )
 
 

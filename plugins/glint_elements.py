@@ -29,7 +29,9 @@ Glints of Gaussian elements (:monosp:`glint_elements`)
  * - flake_density
    - |float|
    - Number of metallic flakes per unit of UV area; they take the place of a map. Flakes are placed
-     by a Poisson-disk pattern on the unit UV square, which repeats.
+     by a Poisson-disk pattern on the unit UV square, which repeats. Another
+     density scatters other flakes. Its derivative is right on average over places, see below.
+   - |exposed|, |differentiable|
 
  * - flake_alpha
    - |float|
@@ -78,6 +80,13 @@ integral of :math:`D` is one within 1e-3 for every footprint.
 
 Flakes cover the whole surface. From afar they cover it evenly, and a point shows the nearest ones.
 To show a base coat between flakes, blend with its material (``blendbsdf``).
+
+*Derivatives with respect to* :monosp:`flake_density`. Flakes do not appear by degrees. But on
+average over places, denser flakes are smaller ones, and what a footprint sees of them depends on
+their relative size: the derivative is that of a footprint which grows among the flakes. It is right
+for averages over many places of whatever is computed from the footprint of one sample, such as the
+contrast of glints; it leaves out what the samples of one pixel differ by their places, a quarter of
+it with a :monosp:`footprint_sigma` of 0.5. Compare statistics of pictures, not single pixels.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

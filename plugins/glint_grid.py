@@ -23,7 +23,7 @@ Procedural glints and grooves (:monosp:`glint_grid`)
    - |float|
    - Decimal logarithm of the number of microdetails per unit of UV area, from -20 to 20. A
      microdetail is about :monosp:`10^(-density/2)` wide in UV. (Default: 8)
-   - |exposed|
+   - |exposed|, |differentiable|
 
  * - size_variation
    - |float|
@@ -99,8 +99,15 @@ so the place may reflect more light than it receives. The sampler draws visible 
 smooth surface, and the glints are in the weight of a sample.
 
 Stretched UV coordinates stretch microdetails. Microdetails finer than four spacings of float32 UV
-coordinates are not resolved. Derivatives with respect to the roughness keep the glints as they are,
-and differentiate the smooth surface; they are exact on average.
+coordinates are not resolved.
+
+*Derivatives* are right on average over places. Those with respect to roughness and
+:monosp:`intensity` are those of the smooth surface times the glints, which stay. The mean over
+places does not depend on :monosp:`density`, but the contrast of glints does: denser microdetails
+are smaller ones, so that its derivative is that of a footprint which grows among them. It is right
+for whatever is computed from the footprint of one sample, and leaves out what the samples of one
+pixel differ by their places. :monosp:`detail_alpha`, :monosp:`size_variation`,
+:monosp:`light_spread` and :monosp:`max_anisotropy` have no derivatives and say so when asked.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

@@ -2,99 +2,93 @@
 
 from __future__ import annotations
 
+from math import log
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 
-from glintbsdf import maps
-from glintbsdf.check.suite import View, check_render_derivative
+from glintbsdf import Footprint
+from glintbsdf.check.derivatives import check_render_derivatives, examples
+from glintbsdf.check.suite import View
+from glintbsdf.pndf import Flakes, Grid
 
-# Parameters, and samples per pixel where more than usual are needed to see the derivative.
-WITH_MAP = {
-    "elements": {"type": "glint_elements", "sigma_r": 0.05},
-    "manifold": {"type": "glint_manifold", "footprint_sigma": 2.0},
-    "tables": {"type": "glint_manifold", "footprint_sigma": 3.0, "max_error": 0.05},
-    "lean": {"type": "glint_filtered", "method": "lean", "alpha": 0.1},
-    "diffuse": {"type": "glint_diffuse", "footprint_sigma": 2.0},
-    "mip": {"type": "glint_mip", "output_size": 128, "patch_size": 16, "sigma_r": 0.05},
-}
-WITHOUT_MAP = {
-    "flakes": {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08},
-    "grid": {"type": "glint_grid", "alpha": 0.2, "density": 6.0},
-    "particles": {
-        "type": "glint_particles",
-        "alpha": 0.2,
-        "micro_alpha": 0.05,
-        "density": 4.0,
-    },
-}
-KEYS = [
-    ("elements", "sigma_r", 64),
-    ("elements", "footprint_sigma", 64),
-    ("elements", "pixel_spread", 64),
-    ("elements", "data", 64),
-    ("manifold", "footprint_sigma", 256),
-    ("manifold", "pixel_spread", 256),
-    ("manifold", "data", 512),
-    ("tables", "footprint_sigma", 256),
-    ("lean", "alpha", 64),
-    ("lean", "pixel_spread", 64),
-    ("lean", "data", 64),
-    ("diffuse", "data", 256),
-    ("mip", "sigma_r", 64),
-    ("flakes", "sigma_r", 64),
-    ("flakes", "flake_alpha", 64),
-    ("grid", "alpha_u", 64),
-    ("particles", "alpha_u", 256),
-    ("particles", "alpha_v", 256),
-    ("particles", "micro_alpha", 256),
-]
+NAMES = (
+    *("elements", "manifold", "manifold, map", "tables", "lean"),
+    *("diffuse", "mip", "flakes", "grid", "particles"),
+)
 
 
 def bsdf(name: str, **settings) -> dict:
-    if name in WITHOUT_MAP:
-        description = WITHOUT_MAP[name]
-    else:
-        normals = maps.isotropic(32, alpha=0.2, correlation_length=3, seed=5).normals
-        description = {**WITH_MAP[name], "data": mi.TensorXf(normals)}
-    return {"pixel_spread": 0.02, **description, **settings}
+    """The description of an example without its adapter."""
+    return {**examples()[name][0]["nested"], **settings}
 
 
 def two_sided(nested: dict) -> dict:
     return {"type": "twosided", "nested": nested}
 
 
-@pytest.mark.parametrize("name, key, spp", KEYS)
-def test_derivative_of_an_image(variant, name, key, spp):
-    check_render_derivative(two_sided(bsdf(name)), key, "prb", spp)
+@pytest.mark.parametrize("name", NAMES)
+def test_derivatives_of_an_image(variant, name):
+    assert set(examples()) == set(NAMES)
+    plate, keys, spp = examples()[name]
+    check_render_derivatives(plate, keys, "prb", spp)
 
 
-@pytest.mark.parametrize("integrator", ["prb_basic", "direct", "path", "glint_path"])
-def test_derivative_in_every_integrator(variant, integrator):
-    check_render_derivative(two_sided(bsdf("elements")), "sigma_r", integrator)
+# Masking is left out where it is not what differs.
+@pytest.mark.parametrize("integrator", ["prb_basic", "direct"])
+def test_derivative_in_other_integrators(variant, integrator):
+    check_render_derivatives(two_sided(bsdf("elements", masking="none")), ["sigma_r"], integrator)
+
+
+@pytest.mark.parametrize("integrator", ["path", "glint_path"])
+def test_derivatives_in_symbolic_integrators(variant, integrator):
+    plate = two_sided(bsdf("elements", masking="none"))
+    check_render_derivatives(plate, ["sigma_r", "data"], integrator)
 
 
 @pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])
 def test_derivative_in_forward_mode(variant, integrator):
-    check_render_derivative(
-        two_sided(bsdf("elements")), "sigma_r", integrator, spp=256, seeds=3, modes=("forward",)
-    )
-
-
-@pytest.mark.parametrize("integrator", ["path", "glint_path"])
-def test_derivative_of_a_map_in_symbolic_integrators(variant, integrator):
-    check_render_derivative(two_sided(bsdf("elements")), "data", integrator)
+    plate = two_sided(bsdf("elements", masking="none"))
+    check_render_derivatives(plate, ["sigma_r"], integrator, spp=256, seeds=3, modes=("forward",))
 
 
 def test_what_has_no_derivative_says_so(variant):
     """Instead of a derivative of zero."""
     grid = mi.load_dict(bsdf("grid"))
     params = mi.traverse(grid)
-    dr.enable_grad(params["density"])
-    with pytest.raises(ValueError, match='glint_grid: "density" has no derivative'):
+    dr.enable_grad(params["detail_alpha_u"])
+    with pytest.raises(ValueError, match='glint_grid: "detail_alpha_u" has no derivative'):
         grid.eval(mi.BSDFContext(), View().interaction(), mi.Vector3f(0, 0, 1))
-    dr.disable_grad(params["density"])
+    dr.disable_grad(params["detail_alpha_u"])
     grid.eval(mi.BSDFContext(), View().interaction(), mi.Vector3f(0, 0, 1))
+
+
+# A step of an optimisation that leaves the range: the parameter, and what it becomes.
+STEPS_TOO_FAR = [
+    ("elements", "sigma_r", -0.01),
+    ("elements", "pixel_spread", -0.01),
+    ("elements", "data", 1.5),
+    ("manifold", "footprint_sigma", -1.0),
+    ("lean", "alpha", 0.0),
+    ("lean", "specular_reflectance.value", 1.5),
+    ("lean", "eta.value", -0.5),
+    ("diffuse", "reflectance.value", -0.1),
+    ("flakes", "flake_alpha", -0.1),
+    ("flakes", "flake_density", 0.2),
+    ("grid", "alpha_u", -0.1),
+    ("grid", "intensity", -0.1),
+]
+
+
+@pytest.mark.parametrize("name, key, value", STEPS_TOO_FAR)
+def test_a_step_out_of_range_is_an_error_with_the_value(variant, name, key, value):
+    params = mi.traverse(mi.load_dict(bsdf(name)))
+    params[key] = params[key] * 0 + value
+    plugin, parameter = bsdf(name)["type"], key.removesuffix(".value")
+    with pytest.raises(ValueError, match=rf'{plugin}: .*"{parameter}".*\(got .*\)'):
+        params.update()
 
 
 def test_flakes_keep_their_places_as_they_turn(variant):
@@ -113,9 +107,51 @@ def test_flakes_keep_their_places_as_they_turn(variant):
         params.update()
 
 
+# The P-NDF for a seed and a density; ln of the density per unit of the parameter, and its step; and
+# the standard deviations of a footprint.
+DENSITIES = {
+    "flakes": (
+        lambda seed, density: Flakes(density, sigma_r=0.05, seed=seed),
+        *("flake_density", 4000.0, 1 / 4000.0, 1600.0, (0.01, 0.01)),
+    ),
+    "grid": (
+        lambda seed, density: Grid(density=density, seed=seed),
+        *("density", 4.0, log(10), 0.1, (0.03, 0.09)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+def test_derivative_with_respect_to_density_is_that_of_contrast(variant, name):
+    """On average over places: each density has a pattern of its own."""
+    make, key, density, scale, step, (du, dv) = DENSITIES[name]
+    rng = np.random.default_rng(1)
+    uv = mi.Point2f(*(mi.Float(row) for row in rng.random((2, 1 << 15), np.float32)))
+    m = mi.Vector2f(*(mi.Float(row) for row in rng.normal(0, 0.1, (2, 1 << 15)).astype("f4")))
+    du, dv = (dr.opaque(mi.Float, sigma) for sigma in (du, dv))
+
+    def mean_square(pndf):
+        footprint = Footprint(uv, mi.Vector2f(du, 0), mi.Vector2f(0, dv))
+        return dr.mean(dr.square(pndf.eval(m, footprint)))
+
+    ours, theirs = [], []
+    for seed in range(4):
+        pndf = make(seed, density)
+        dr.enable_grad(getattr(pndf, key))
+        value = mean_square(pndf)
+        dr.backward(value)
+        ours.append(dr.grad(getattr(pndf, key))[0] / (scale * value[0]))
+        more, fewer = (mean_square(make(seed, density + sign * step))[0] for sign in (1, -1))
+        ratio = log((density + step) / (density - step)) if name == "flakes" else 2 * step * scale
+        theirs.append((more - fewer) / (ratio * value[0]))
+    noise = 3 * np.std(np.subtract(ours, theirs), ddof=1) / 2
+    assert abs(np.mean(ours) - np.mean(theirs)) <= noise, (ours, theirs)
+    assert noise <= 0.5 * abs(np.mean(theirs)), (ours, theirs)
+
+
 @pytest.mark.parametrize("adapter", ["normalmap", "blendbsdf"])
 def test_derivative_inside_of_adapters(variant, adapter):
-    nested = bsdf("elements")
+    nested = bsdf("elements", masking="none")
     if adapter == "normalmap":
         flat = mi.TensorXf([0.5, 0.5, 1.0], (1, 1, 3))
         texture = {"type": "bitmap", "data": flat, "raw": True, "filter_type": "nearest"}
@@ -127,38 +163,4 @@ def test_derivative_inside_of_adapters(variant, adapter):
             "first": nested,
             "second": {"type": "diffuse"},
         }
-    check_render_derivative(two_sided(outer), "sigma_r", "prb")
-
-
-@pytest.mark.parametrize("name, key", [("elements", "sigma_r"), ("manifold", "data")])
-def test_steps_of_an_optimisation_need_no_new_kernel(variant, name, key):
-    plate = {"type": "rectangle", "bsdf": two_sided(bsdf(name, masking="none"))}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "prb", "max_depth": 2},
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 4, "height": 4},
-            },
-            "plate": plate,
-            "light": {"type": "point", "position": [0.2, 0.1, 4], "intensity": 1.0},
-        }
-    )
-    params = mi.traverse(scene)
-    (name,) = (k for k in params.keys() if k.endswith("." + key))  # noqa: SIM118 (not a dict)
-    start = params[name] + 0
-    missed = []
-    for step in range(3):
-        # As optimisers do it: a factor written as a number would be a part of a kernel.
-        params[name] = start * dr.opaque(mi.Float, 1 + 0.01 * step)
-        dr.enable_grad(params[name])
-        dr.kernel_history_clear()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            params.update()
-            dr.backward(dr.mean(mi.render(scene, params, spp=4, seed=step), axis=None))
-            dr.eval(dr.grad(params[name]))
-            history = dr.kernel_history([dr.KernelType.JIT])
-        missed.append(sum(not kernel["cache_hit"] for kernel in history))
-    assert missed[2] == 0, missed
+    check_render_derivatives(two_sided(outer), ["sigma_r"], "prb")

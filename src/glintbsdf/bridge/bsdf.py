@@ -12,9 +12,10 @@ from weakref import WeakSet
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried
-from glintbsdf.bridge.parameters import Parameters, check_to_uv, declared_range
+from glintbsdf.bridge.parameters import EXTINCTION, Parameters, check_to_uv, declared_range
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
 from glintbsdf.bridge.surfaces import doubt_of_green, require_uvs, shapes_of
@@ -66,6 +67,27 @@ class RefusesDerivatives:
                 raise ParameterError(
                     f'{self.owner}: "{name}" has no derivative (asked for by dr.enable_grad)'
                 )
+
+
+class ChecksSpectra:
+    """A callback of ``traverse`` that raises :class:`~.ParameterError` where a spectrum that was
+    given as numbers has left its range. ``keys``: the parameters to look at; empty for all."""
+
+    def __init__(self, owner: str, keys: Sequence[str]) -> None:
+        self.owner, self.keys = owner, keys
+
+    def put(self, name: str, value: object, flags: int) -> None:
+        """Called for every parameter, as ``mi.TraversalCallback.put`` is."""
+        if not isinstance(value, mi.Texture) or (self.keys and name not in self.keys):
+            return
+        numbers = mi.traverse(value)
+        if "value" not in numbers:
+            return
+        values = np.array(numbers["value"]).ravel()
+        largest = EXTINCTION.maximum if name in ("eta", "k") else 1.0
+        allowed = (values >= 0) & (values <= largest)
+        requirement = f"a spectrum of values from 0 to {largest:g}"
+        check(allowed.all(), self.owner, name, requirement, values.tolist())
 
 
 class FootprintBSDF(mi.BSDF):
@@ -140,6 +162,7 @@ class FootprintBSDF(mi.BSDF):
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         self.traverse(MakesOpaque())
+        self.traverse(ChecksSpectra(self.owner, keys))
         if not keys or "to_uv" in keys:
             check_to_uv(self.owner, self.to_uv)
         for key in {"footprint_sigma", "pixel_spread"} & set(keys):

@@ -128,7 +128,9 @@ def add_samples(
     column = pixel - row * width
     order = number - pixel * per_pixel + dr.opaque(mi.UInt32, index * per_pass)
     x, y = (i + dr.opaque(mi.UInt32, o) for i, o in zip((column, row), offset, strict=True))
-    jitter, sign = shared.place(sampler, x, y, order, mi.UInt32(seed))
+    seed = mi.UInt32(seed)
+    dr.make_opaque(seed)  # Mitsuba gives a literal, which would be a part of the kernel
+    jitter, sign = shared.place(sampler, x, y, order, seed)
     place = (mi.Point2f(column, row) + 0.5 + jitter) * dr.rcp(mi.ScalarVector2f(size))
 
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)

@@ -96,6 +96,22 @@ class Footprint:
         to_uv = mi.AffineTransform3f(to_uv)
         return Footprint(to_uv @ self.uv, to_uv @ self.du, to_uv @ self.dv)
 
+    def among_details(self, growth: mi.Float) -> Footprint:
+        """The same footprint, with the derivative of a pattern of details that grows denser.
+
+        Drawing more details has no derivative. But on average over places, a random pattern whose
+        density grows is one that shrinks by √``growth``, and what a footprint shows of it depends
+        on their relative size alone: so it is the footprint that grows here, where it is. Averaged
+        over places, the derivative of anything computed from D of one footprint is right: of its
+        mean, its contrast and so on.
+
+        ``growth``: the density over its own value, which is 1 with a derivative.
+        """
+        if not dr.grad_enabled(growth):
+            return self
+        stretch = dr.sqrt(growth)
+        return Footprint(self.uv, self.du * stretch, self.dv * stretch)
+
     def is_known_to_be_zero(self) -> bool:
         """Whether it is certain while a kernel is being recorded that this footprint is a point.
 

@@ -19,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.opaque import stored
+
 #: Nodes of the table of a filter's profile.
 NODES = 1025
 
@@ -57,7 +59,7 @@ class PixelFilter:
         radius = rfilter.radius()
         # A box drops to zero at its ends: we stay within them, by less than a sample would notice.
         x = np.linspace(-radius, radius, NODES) * (1 - 1e-6)
-        profile = np.array(rfilter.eval(mi.Float(x.astype(np.float32))), dtype=np.float64)
+        profile = np.array(rfilter.eval(stored(mi.Float, x.astype(np.float32))), dtype=np.float64)
         step = x[1] - x[0]
         mass, total = (np.trapezoid(f, dx=step) for f in (profile, np.abs(profile)))
         self.variance = float(np.trapezoid(profile * x * x, dx=step) / mass)
@@ -65,7 +67,8 @@ class PixelFilter:
         self.positive = bool(np.all(profile >= 0))
         self.rfilter = rfilter
         self.distribution = mi.ContinuousDistribution(
-            mi.ScalarVector2f(-radius, radius), mi.Float(np.abs(profile).astype(np.float32))
+            mi.ScalarVector2f(-radius, radius),
+            stored(mi.Float, np.abs(profile).astype(np.float32)),
         )
 
     def sample(self, sample: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:

@@ -24,7 +24,7 @@ import numpy as np
 from glintbsdf.core.errors import check
 from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.core.opaque import stored
+from glintbsdf.core.opaque import opaque, stored
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
@@ -174,7 +174,7 @@ class Mixture(PNDF):
         lattice (Lattice): the cells; a map has ``map_cells`` (columns, rows) of them.
         lists (QuadLists): for each bin of normals, the cells whose elements may contribute to it;
             None where all footprints are small.
-        variance (float): variance σ_h² of an element's position (S = σ_h² I), cells².
+        variance (float or mi.Float): variance σ_h² of an element's position (S = σ_h² I), cells².
         sigma_r (mi.Float): standard deviation σ_r of the normals of a flat element.
         wrap_mode (str): how the map continues beyond its border.
 
@@ -184,7 +184,7 @@ class Mixture(PNDF):
     lattice: Lattice
     map_cells: tuple[int, int]
     lists: QuadLists | None
-    variance: float
+    variance: float | mi.Float
     sigma_r: mi.Float
     element_bytes: int
     wrap_mode: str
@@ -263,7 +263,7 @@ class Mixture(PNDF):
         added = (self.variance, self.variance)
         kernel = TexelKernel("gaussian", footprint, rows, columns, self.wrap_mode, added)
         kernel.mean = kernel.mean - mi.Vector2f(*self.origin)
-        steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H / sqrt(self.variance))
+        steps = dr.sqrt(kernel.minor_variance) * (SIGMA_H * dr.rsqrt(self.variance))
         cut = cut_of_sums(steps, self.point_cut)
         kernel.cut_at(dr.sqrt(cut))
         small = self.is_small(kernel, steps)
@@ -392,7 +392,7 @@ class Mixture(PNDF):
                 variance = variance + dr.squared_norm(query.turn @ axis)
         # ``variance`` and ``slope`` are of both components together, ``own`` is of one.
         curved = 0.5 * self.levels.slope**2 * self.variance / SIGMA_H**2
-        own = dr.square(self.sigma_r) + dr.opaque(mi.Float, curved)
+        own = dr.square(self.sigma_r) + opaque(mi.Float, curved)
         return ~small & (variance > 2 * LISTS_SPREAD * own)
 
     def _sample(
@@ -812,7 +812,7 @@ class Elements(Mixture):
         if keys and not {"data", "sigma_r"} & set(keys):
             return
         check_sigma_r(self.owner, self.sigma_r[0])
-        self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner)
+        self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
         self.changed = True
         self.build(self.domain)
 

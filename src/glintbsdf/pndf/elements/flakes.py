@@ -57,7 +57,7 @@ class Surroundings:
     """A square around ``mean`` (cells) in place of a kernel; ``reach_v`` is half its side."""
 
     mean: mi.Point2f
-    reach_v: float
+    reach_v: mi.Float
 
     def row_extent(self, top, bottom):
         return -self.reach_v, self.reach_v
@@ -88,6 +88,8 @@ class Flakes(Mixture):
     Attributes:
         flake_alpha (mi.Float): α. Derivatives with respect to it leave every flake in its place,
             and scale its slope.
+        flake_density (mi.Float): flakes per unit of UV area; other values scatter other flakes. Its
+            derivatives are those of a pattern that shrinks, see :meth:`.Footprint.among_details`.
 
     Raises:
         ParameterError: a parameter is out of range, or there are more flakes than half of the
@@ -109,25 +111,30 @@ class Flakes(Mixture):
         owner: str = "Flakes",
     ) -> None:
         check_sigma_r(owner, sigma_r)
-        check(1 <= density < inf, owner, "flake_density", "a finite number ≥ 1", density)
+        check_density(owner, density)
         check_alpha(owner, alpha)
         check_whole(seed, lambda value: value >= 0, owner, "seed", "≥ 0")
-        self.count, self.seed, self.owner = round(density), seed, owner
-        check_memory(owner, self.count)
+        self.seed, self.owner = seed, owner
+        self.flake_density = mi.Float(density)
         self.sigma_r, self.flake_alpha = mi.Float(sigma_r), mi.Float(alpha)
+        self.strew(round(density))
+        self.build()
 
-        flakes = self.cached(self.scatter, self.count, self.seed)
-        n = cells_for(self.count)
-        self.map_cells = n, n
-        self.variance = (SIGMA_H * n / sqrt(self.count)) ** 2
+    def strew(self, count: int) -> None:
+        """Scatter so many flakes. Their number is a variable of kernels, as that of texels is."""
+        check_memory(self.owner, count)
+        self.count = count
+        flakes = self.cached(self.scatter, count, self.seed)
+        n = cells_for(count)
+        self.map_cells, self.row_pitch = (n, n), dr.opaque(mi.UInt32, n)
+        self.variance = dr.opaque(mi.Float, (SIGMA_H * n / sqrt(count)) ** 2)
         self.lattice = Lattice(n, n, "repeat")
         self.places, self.deviates = flakes["places"], flakes["deviates"]
         self.areas = stored(mi.Float, flakes["areas"].ravel())
         self.exist = flakes["areas"].ravel() > 0
-        self.densest = float(flakes["densest"])
-        self.turn(alpha)
+        self.densest = dr.opaque(mi.Float, float(flakes["densest"]))
+        self.turn(self.flake_alpha[0])
         self.element_bytes = 4 * (dr.width(self.flakes) + dr.width(self.areas))
-        self.build()
 
     def scatter(self) -> dict[str, np.ndarray]:
         """Positions, areas and normal deviates of the flakes, by cell (n×n), and a bound on the sum
@@ -147,12 +154,12 @@ class Flakes(Mixture):
         slopes = (alpha / sqrt(2)) * self.deviates
         normals = slopes / np.sqrt(1 + np.square(slopes).sum(axis=-1, keepdims=True))
         self.flake_normals = normals[self.exist].astype(np.float32)
-        normals = mi.Vector2f(normals.T.astype(np.float32))
+        normals = vectors(normals)
         if dr.grad_enabled(self.flake_alpha):
-            deviates = mi.Vector2f(self.deviates.T.astype(np.float32))
+            deviates = vectors(self.deviates)
             slopes = self.flake_alpha * (1 / sqrt(2)) * deviates
             normals = slopes * dr.rsqrt(1 + dr.squared_norm(slopes))
-        place = mi.Vector2f(self.places.T)
+        place = vectors(self.places)
         self.flakes = dr.ravel(mi.Vector4f(place.x, place.y, normals.x, normals.y))
         dr.eval(self.flakes)
 
@@ -166,7 +173,8 @@ class Flakes(Mixture):
 
     def build(self, domain: Domain | None = None) -> None:
         """Build everything that depends on ``sigma_r``, for any query."""
-        reach = NORMAL_REACH * self.sigma_r[0]
+        # A variable, or every roughness would need kernels of its own.
+        reach = dr.opaque(mi.Float, NORMAL_REACH * self.sigma_r[0])
 
         def ellipses(row, column, active):
             normal = dr.detach(self.flake(row, column, active)[1])
@@ -187,7 +195,11 @@ class Flakes(Mixture):
         self.slopes = self.make_slopes() if self.masked else None
 
     def index(self, row, column):
-        return mi.UInt32(row * self.map_cells[0] + column)
+        return mi.UInt32(row) * self.row_pitch + mi.UInt32(column)
+
+    def weigh(self, footprint):
+        growth = self.flake_density / dr.detach(self.flake_density)
+        return super().weigh(footprint.among_details(growth))
 
     def flake(self, row, column, active):
         """Position in its cell (cells), and projected normal, of the flake of a cell."""
@@ -252,7 +264,7 @@ class Flakes(Mixture):
                 dr.select(taken, corner + place, offset),
             )
 
-        surroundings = Surroundings(position, 5 * sqrt(self.variance))
+        surroundings = Surroundings(position, 5 * dr.sqrt(self.variance))
         state = mi.Float(0), mi.Float(random_x), mi.Int(0), mi.Int(0), mi.Vector2f(0)
         total, _, x, y, offset = self.all.visit(mi.Vector2f(0), surroundings, add, active, state)
         return x, y, position + offset, total / (2 * pi * self.variance * self.densest)
@@ -263,14 +275,19 @@ class Flakes(Mixture):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("sigma_r", self.sigma_r, mi.ParamFlags.Differentiable)
         callback.put("flake_alpha", self.flake_alpha, mi.ParamFlags.Differentiable)
+        callback.put("flake_density", self.flake_density, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Check new roughnesses, and rebuild."""
-        if keys and not {"sigma_r", "flake_alpha"} & set(keys):
+        """Check new values, and rebuild."""
+        if keys and not {"sigma_r", "flake_alpha", "flake_density"} & set(keys):
             return
         check_sigma_r(self.owner, self.sigma_r[0])
         check_alpha(self.owner, self.flake_alpha[0])
+        check_density(self.owner, self.flake_density[0])
         self.changed = True
+        count = round(self.flake_density[0])
+        if count != self.count:
+            self.strew(count)
         self.turn(self.flake_alpha[0])
         self.build()
 
@@ -282,6 +299,16 @@ class Flakes(Mixture):
             f"Flakes[{self.count} flakes, alpha={self.flake_alpha[0]:g}, "
             f"sigma_r={self.sigma_r[0]:g}, seed={self.seed}, {self.nbytes / 2**20:.1f} MiB]"
         )
+
+
+def vectors(rows: np.ndarray) -> mi.Vector2f:
+    """The rows of an array (N, 2)."""
+    return mi.Vector2f(*(stored(mi.Float, column.astype(np.float32)) for column in rows.T))
+
+
+def check_density(owner: str, density: float) -> None:
+    """Raise :class:`~.ParameterError` for a density of flakes that is not allowed."""
+    check(1 <= density < inf, owner, "flake_density", "a finite number ≥ 1", density)
 
 
 def check_alpha(owner: str, alpha: float) -> None:

@@ -113,7 +113,9 @@ class CoveredCells:
         size = dr.maximum(2 * minor, 2 * major / max_anisotropy)
         size = dr.maximum(size, UV_RESOLUTION * dr.max(dr.abs(footprint.uv)) * scale)
         size = dr.clip(size, 1, limit)
-        self.level = mi.Int(dr.reinterpret_array(mi.UInt32, size) >> 23) - 127  # floor(log2)
+        self.level = (
+            mi.Int(dr.reinterpret_array(mi.UInt32, dr.detach(size)) >> 23) - 127
+        )  # floor(log2)
         self.blend = dr.log2(size * power_of_two(-self.level))
 
         # The median, in stretched coordinates: p along it and q across, q = slope · p
@@ -202,7 +204,9 @@ def covariance(du: mi.Vector2f, dv: mi.Vector2f) -> tuple[mi.Float, mi.Float, mi
 def larger_eigenvalue(a: mi.Float, b: mi.Float, c: mi.Float) -> mi.Float:
     """The larger eigenvalue of the symmetric matrix ((a, b), (b, c))."""
     difference = 0.5 * (a - c)
-    return 0.5 * (a + c) + dr.sqrt(dr.fma(difference, difference, b * b))
+    # Of a round footprint the root is 0, where it has no derivative.
+    squared = dr.maximum(dr.fma(difference, difference, b * b), dr.smallest(mi.Float))
+    return 0.5 * (a + c) + dr.sqrt(squared)
 
 
 def power_of_two(exponent: mi.Int) -> mi.Float:
@@ -349,8 +353,11 @@ class Grid(PNDF):
     the Beckmann distribution. At a single position D is not normalised: a surplus of microdetails
     in one direction is not compensated by a lack in others. Samples are drawn from the mean.
 
-    Derivatives flow through the Beckmann density alone. The glints then stay in their places, and
-    the derivative of the mean is exact.
+    Derivatives are right on average over places. Those with respect to the roughness and to
+    ``intensity`` flow through the Beckmann density alone: the glints then stay in their places.
+    Those with respect to ``density`` and to the size of the footprint flow through the weights of
+    the cells, see :meth:`.Footprint.among_details`. Other parameters have none. They do not change
+    the mean over places, and counts of microdetails do not change by degrees.
 
     It belongs to the variant of Mitsuba that is active when it is made.
 
@@ -498,7 +505,9 @@ class Grid(PNDF):
             p = self.largest_p * dr.exp(-dr.squared_norm(x / self.alpha))
             active &= p > dr.smallest(mi.Float)
             hp = paraboloid_map(x, cos_theta) * self.cells_per_unit
-            noise = self.reflecting(hp, p, query.footprint, active) / dr.select(active, p, 1)
+        growth = dr.exp((self.density - dr.detach(self.density)) * log(10))
+        footprint = query.footprint.among_details(growth)
+        noise = self.reflecting(hp, p, footprint, active) / dr.select(active, p, 1)
         return dr.select(active, density * noise, 0)
 
     def reflecting(
@@ -536,7 +545,7 @@ class Grid(PNDF):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         smooth, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.NonDifferentiable
         for name in self.NAMES:
-            is_smooth = name in ("alpha_u", "alpha_v", "intensity")
+            is_smooth = name in ("alpha_u", "alpha_v", "density", "intensity")
             callback.put(name, getattr(self, name), smooth if is_smooth else discontinuous)
 
     def __repr__(self) -> str:

@@ -32,6 +32,9 @@ RESOLUTION = 1024
 #: Numbers of cells per axis to try; the builder takes the largest one that the memory allows.
 DIVISIONS = (48, 40, 32, 28, 24, 20, 16, 12, 8, 6, 4, 3, 2, 1)
 
+#: Blocks, at most, from which the memory of the lists is estimated.
+SAMPLED_BLOCKS = 512
+
 #: Memory allowed to the lists, bytes per quad; the vertices are not counted.
 BYTES_PER_QUAD = 48
 
@@ -506,15 +509,22 @@ class Builder:
         return tables
 
     def bytes_per_quad(self, divisions: int) -> float:
-        """Memory of the lists with this many divisions, estimated from a sample of blocks."""
+        """Memory of the lists with this many divisions, estimated from a sample of blocks.
+
+        Where the offsets alone take more than is allowed, nothing is sampled.
+        """
+        offsets = (2 + 6 / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
+        if offsets > self.allowed:
+            return offsets
         self.use(divisions)
-        sample = np.random.default_rng(0).integers(0, self.rows * self.columns, 512)
+        count = self.rows * self.columns
+        sample = np.arange(count)
+        if count > SAMPLED_BLOCKS:
+            sample = np.random.default_rng(0).integers(0, count, SAMPLED_BLOCKS)
         row, column = (stored(mi.UInt32, v.astype(np.uint32)) for v in divmod(sample, self.columns))
         counter = dr.zeros(mi.UInt32, 1)
         self.scan(row, column, lambda cell: mi.UInt32(0), counter)
-        entries = counter[0] / (len(sample) * self.blocks.mean_count)
-        offsets = (2 + 6 / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
-        return 2 * entries + offsets
+        return 2 * counter[0] / (len(sample) * self.blocks.mean_count) + offsets
 
     def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
         """Scan the rows of blocks of a strip.

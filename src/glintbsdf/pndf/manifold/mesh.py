@@ -266,9 +266,8 @@ class TexelMesh:
         if keys and "data" not in keys:
             return
         self.changed = True
-        self.normal_map = NormalMap(
-            self.data.numpy(), wrap_mode=self.normal_map.wrap_mode, owner=self.owner
-        )
+        wrap_mode = self.normal_map.wrap_mode
+        self.normal_map = NormalMap(self.data.numpy(), wrap_mode, self.owner, "data")
         self.make_vertices()
 
     def parts(self) -> dict[str, int]:

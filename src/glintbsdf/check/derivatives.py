@@ -1,0 +1,272 @@
+"""Derivatives of images with respect to the parameters of a BSDF, against differences of images.
+
+Two modes of automatic differentiation agree on a graph that is wrong. So what counts is the image:
+:func:`render_derivatives` renders a plate under a lamp, by any integrator, and compares what
+``mi.render`` returns with central differences of the same random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from glintbsdf import maps
+from glintbsdf.core.alignment import aligned
+
+#: Relative step of central differences.
+STEP = 0.02
+
+#: Relative error allowed, where three standard errors are less.
+ERROR = 0.02
+
+
+@dataclass(frozen=True)
+class Derivative:
+    """A derivative of an image, and what differences say of it.
+
+    Attributes:
+        key (str): the parameter, as ``mi.traverse`` names it in the BSDF.
+        mode (str): ``reverse`` or ``forward``.
+        automatic, difference (float): both derivatives, per relative change of the parameter.
+        noise (float): three standard errors of the mean difference between both.
+        compiled (int): kernels that Dr.Jit compiled after the first seed.
+    """
+
+    key: str
+    mode: str
+    automatic: float
+    difference: float
+    noise: float
+    compiled: int
+
+    @property
+    def right(self) -> bool:
+        """Whether both agree within 2 %, or within their noise."""
+        allowed = max(self.noise, ERROR * abs(self.difference))
+        return abs(self.automatic - self.difference) <= allowed
+
+    def row(self) -> dict:
+        """The derivative as a row of a table."""
+        return {**asdict(self), "right": str(self.right)}
+
+    def __str__(self) -> str:
+        return (
+            f"{self.key}, {self.mode}: {self.automatic:.4g}, central differences "
+            f"{self.difference:.4g}, noise {self.noise:.2g}, {self.compiled} kernels compiled anew"
+        )
+
+
+#: Integrators whose derivatives are right.
+INTEGRATORS = ("prb", "prb_basic", "direct", "path", "glint_path")
+
+
+def examples() -> dict[str, tuple[dict, tuple[str, ...], int]]:
+    """Every plugin with all of its parameters that have a derivative image by image.
+
+    By name: a description inside of an adapter for its back; the parameters; and the samples per
+    pixel that it takes to see their derivatives. The densities of flakes and of microdetails are
+    not among them: their derivatives are right on average over patterns alone.
+    """
+    normals = maps.isotropic(32, alpha=0.2, correlation_length=3, seed=5).normals
+    data = {"data": mi.TensorXf(normals)}
+    metal = {"eta": 0.2, "k": 3.9, "specular_reflectance": 0.7}
+    of_metal = ("eta.value", "k.value", "specular_reflectance.value")
+    sizes = ("footprint_sigma", "pixel_spread")
+    elements = {"type": "glint_elements", "sigma_r": 0.05, **data}
+    manifold = {"type": "glint_manifold", "footprint_sigma": 2.0, **data}
+    tables = {**manifold, "footprint_sigma": 3.0, "max_error": 0.05}
+    lean = {"type": "glint_filtered", "alpha": 0.1, **metal, **data}
+    diffuse = {"type": "glint_diffuse", "footprint_sigma": 2.0, **data}
+    mip = {
+        "type": "glint_mip", "output_size": 128, "patch_size": 16, "sigma_r": 0.05, **data
+    }  # fmt: skip
+    flakes = {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08}
+    grid = {"type": "glint_grid", "alpha": 0.2, "density": 6.0, "int_ior": 1.5}
+    particles = {"type": "glint_particles", "alpha": 0.2, "micro_alpha": 0.05, "density": 4.0}
+    table = {
+        "elements": (elements, ("sigma_r", *sizes, "data"), 64),
+        "manifold": (manifold, sizes, 256),
+        "manifold, map": (manifold, ("data",), 256),
+        "tables": (tables, ("footprint_sigma",), 256),
+        "lean": (lean, ("alpha", "pixel_spread", "data", *of_metal), 64),
+        "diffuse": (diffuse, ("data", "reflectance.value"), 16),
+        "mip": (mip, ("sigma_r",), 16),
+        "flakes": (flakes, ("sigma_r", "flake_alpha"), 64),
+        "particles": (particles, ("alpha_u", "alpha_v", "micro_alpha"), 256),
+        "grid": (grid, ("alpha_u", "alpha_v", "intensity", "eta"), 64),
+    }
+    return {
+        name: ({"type": "twosided", "nested": {"pixel_spread": 0.02, **bsdf}}, keys, spp)
+        for name, (bsdf, keys, spp) in table.items()
+    }
+
+
+def plate(bsdf: dict, integrator: str = "prb", size: int = 16) -> dict:
+    """A plate under a spherical lamp, for ``mi.load_dict``; the picture has ``size``² pixels."""
+    depth = {} if integrator == "direct" else {"max_depth": 2}
+    return {
+        "type": "scene",
+        "integrator": {"type": integrator, **depth},
+        "sensor": {
+            "type": "perspective",
+            "fov": 30,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        },
+        "plate": {"type": "rectangle", "bsdf": bsdf},
+        "lamp": {
+            "type": "sphere",
+            "center": [0.6, 0.3, 4],
+            "radius": 0.5,
+            "emitter": {"type": "area", "radiance": 10.0},
+        },
+    }
+
+
+class Grown:
+    """Parameters of a scene, all values of each times a factor.
+
+    Attributes:
+        names (dict): what ``mi.traverse`` of the scene calls each key.
+    """
+
+    def __init__(self, scene: mi.Scene, keys: Sequence[str]) -> None:
+        self.params = mi.traverse(scene)
+        known = list(self.params.keys())
+        self.names = {}
+        for key in keys:
+            found = [n for n in known if n.startswith("plate.") and n.endswith("." + key)]
+            if len(found) != 1:
+                raise ValueError(f'"{key}" must be a parameter of the BSDF (got {known})')
+            self.names[key] = found[0]
+        self.start = {key: np.array(self.params[name]) for key, name in self.names.items()}
+        self.now: dict[str, tuple] = {}
+
+    def values(self, key: str, factor: float) -> object:
+        """The values of a parameter, in its own type."""
+        kind = type(self.params[self.names[key]])
+        values = aligned((self.start[key] * factor).astype(np.float32))
+        return kind(values) if dr.is_tensor_v(kind) else kind(values.ravel())
+
+    def set(self, factor: float, differentiable: bool, **others: float) -> None:
+        """Set all parameters; ``others``: the factors of some of them, by key."""
+        for key, name in self.names.items():
+            wanted = others.get(key, factor), differentiable
+            if self.now.get(key) == wanted and not differentiable:
+                continue  # or the structures that depend on it would be made anew
+            self.now[key] = wanted
+            self.params[name] = self.values(key, wanted[0])
+            if differentiable:
+                dr.enable_grad(self.params[name])
+        self.params.update()
+
+
+def render_derivatives(
+    bsdf: dict,
+    keys: Sequence[str],
+    integrator: str = "prb",
+    spp: int = 64,
+    seeds: int = 5,
+    modes: Sequence[str] = ("reverse",),
+) -> list[Derivative]:
+    """Derivatives of an image with respect to parameters, and differences of images.
+
+    The image is weighed by itself, so that contrast counts as well as brightness. All values of a
+    parameter grow by the same factor. In reverse mode all parameters are differentiated at once. In
+    forward mode they are asked for together: the result is their sum, under the keys' names.
+
+    Args:
+        bsdf: description of the BSDF, with an adapter for its back.
+        keys: the parameters, as ``mi.traverse`` names them in the BSDF.
+        spp: samples per pixel of 16².
+        seeds: how many seeds, which tell the noise.
+    """
+    scene = mi.load_dict(plate(bsdf, integrator))
+    grown = Grown(scene, keys)
+    grown.set(1, False)
+    weights = mi.render(scene, spp=4 * spp, seed=seeds)
+    weights = dr.detach(weights / dr.mean(weights, axis=None))
+
+    def measure(seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
+        return dr.mean(mi.render(scene, params, spp=spp, seed=seed) * weights, axis=None)
+
+    def difference(key: str, seed: int) -> float:
+        values = []
+        for factor in (1 + STEP, 1 - STEP):
+            grown.set(1, False, **{key: factor})
+            values.append(float(measure(seed).array[0]))
+        return (values[0] - values[1]) / (2 * STEP)
+
+    def reverse(seed: int) -> list[float]:
+        grown.set(1 + 1e-4 * seed, True)  # other values, as steps of an optimisation have
+        dr.backward(measure(seed, grown.params))
+        gradients = {key: dr.grad(grown.params[name]) for key, name in grown.names.items()}
+        return [
+            float((np.array(gradients[key]).reshape(start.shape) * start).sum())
+            for key, start in grown.start.items()
+        ]
+
+    def forward(seed: int) -> float:
+        grown.set(1 + 1e-4 * seed, True)
+        # What an update derives from a parameter lies outside of the rendering: it takes its
+        # derivative first, as Mitsuba asks it of everybody who goes forward.
+        for key, name in grown.names.items():
+            dr.set_grad(grown.params[name], grown.values(key, 1))
+            dr.enqueue(dr.ADMode.Forward, grown.params[name])
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        return float(dr.forward_to(measure(seed, grown.params)).array[0])
+
+    differences: list[list[float]] = []
+    automatic: dict[str, list[list[float]]] = {mode: [] for mode in modes}
+    compiled = 0
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for seed in range(seeds):
+            dr.kernel_history_clear()
+            differences.append([difference(key, seed) for key in keys])
+            if "reverse" in modes:
+                automatic["reverse"].append(reverse(seed))
+            if "forward" in modes:
+                automatic["forward"].append([forward(seed)])
+            if seed > 0:
+                history = dr.kernel_history([dr.KernelType.JIT])
+                compiled += sum(not kernel["cache_hit"] for kernel in history)
+
+    def compared(key: str, mode: str, ours: np.ndarray, theirs: np.ndarray) -> Derivative:
+        noise = 3 * (ours - theirs).std(ddof=1) / np.sqrt(seeds)
+        return Derivative(
+            key, mode, float(ours.mean()), float(theirs.mean()), float(noise), compiled
+        )
+
+    theirs, result = np.array(differences), []
+    if "reverse" in modes:
+        ours = np.array(automatic["reverse"])
+        result += [compared(key, "reverse", ours[:, i], theirs[:, i]) for i, key in enumerate(keys)]
+    if "forward" in modes:
+        ours = np.array(automatic["forward"])[:, 0]
+        result.append(compared(" + ".join(keys), "forward", ours, theirs.sum(axis=1)))
+    return result
+
+
+def check_render_derivatives(
+    bsdf: dict,
+    keys: Sequence[str],
+    integrator: str = "prb",
+    spp: int = 64,
+    seeds: int = 5,
+    modes: Sequence[str] = ("reverse",),
+    resolution: float = 0.5,
+) -> None:
+    """Derivatives of an image are right, and their steps compile no kernel anew.
+
+    See :func:`render_derivatives`. A check so noisy that it would let ``resolution`` times the
+    derivative pass fails as well.
+    """
+    for derivative in render_derivatives(bsdf, keys, integrator, spp, seeds, modes):
+        assert derivative.right, f"{integrator}: {derivative}"
+        clear = derivative.noise <= resolution * abs(derivative.difference)
+        assert clear, f"{integrator}, too noisy: {derivative}"
+        assert derivative.compiled == 0, f"{integrator}: {derivative}"
