@@ -26,7 +26,7 @@ from glintbsdf.footprint.kernels import difference_of_products
 MAX_ANISOTROPY = 16.0
 
 #: Up to this elongation a footprint is one round probe of the same area.
-ROUND = 2.0
+ROUND = 3.0
 
 #: Range of a vertex's random displacement, in cells, and the sharpness of the bell around it.
 DISPLACEMENT, SHARPNESS = 0.8, 4.0
