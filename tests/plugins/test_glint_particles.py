@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from glintbsdf.check import densities, suite
+from glintbsdf.check import densities, robustness, suite
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 
 SURFACES = {
@@ -140,6 +140,11 @@ def test_extremes_are_finite(variant, name):
 def test_extreme_parameters(variant, density, micro_alpha):
     for view in EXTREME_VIEWS.values():
         suite.check_finite(load(density=density, micro_alpha=micro_alpha), view)
+
+
+@pytest.mark.parametrize("parameters", [{"density": 16.0}, {"density": -8.0}, {"space": "object"}])
+def test_combined_extremes_are_finite(variant, parameters):
+    assert robustness.extremes(load(**parameters), 2048) == {"nan": 0, "negative": 0}
 
 
 def test_furnace_from_above(variant):

@@ -207,12 +207,14 @@ class DoubleMitsuba:
 
 
 class DoubleDrJit:
-    """Dr.Jit's functions. The bits of a float are still those of a float32."""
+    """Dr.Jit's functions. The 32 bits of a float are still those of a float32."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(dr, name)
 
     def reinterpret_array(self, kind: type, value: object) -> object:
+        if mi.UInt64 in (kind, type(value)):
+            return dr.reinterpret_array(kind, value)
         if kind is mi.Float64:
             return mi.Float64(dr.reinterpret_array(mi.Float32, value))
         return dr.reinterpret_array(kind, mi.Float32(value) if type(value) is mi.Float64 else value)

@@ -107,7 +107,9 @@ def test_share_of_the_coarser_level(variant):
 @pytest.mark.parametrize("ratio", [1.0, 2.9, 3.1, 6.0, 16.0])
 def test_probes_have_the_footprints_area_and_variance(variant, ratio):
     c, s = np.cos(0.7), np.sin(0.7)
-    probes = Probes([mi.Float(ratio * c), mi.Float(ratio * s)], [mi.Float(-s), mi.Float(c)])
+    probes = Probes(
+        [mi.Float(ratio * c), mi.Float(ratio * s)], [mi.Float(-s), mi.Float(c)], mi.Float(1)
+    )
     count = int(probes.count[0])
     order = np.arange(count) - count // 2
     weights = np.array([probes.weight(mi.Int(int(k)))[0] for k in order])
@@ -125,7 +127,7 @@ def test_probes_have_the_footprints_area_and_variance(variant, ratio):
 
 def test_probes_are_drawn_by_their_shares(variant):
     c = mi.Float(9.0)
-    probes = Probes([c, mi.Float(0)], [mi.Float(0), mi.Float(1)])
+    probes = Probes([c, mi.Float(0)], [mi.Float(0), mi.Float(1)], mi.Float(1))
     probe, left = probes.draw((dr.arange(mi.Float, COUNT) + 0.5) / COUNT)
     probe, left = np.array(probe), np.array(left)
     for k in np.unique(probe):

@@ -74,8 +74,9 @@ class Probes:
     is covered by more, as many of their areas as make up its own.
 
     Args:
-        first, second: conjugate semi-axes of the footprint, lists of 2 or 3 ``mi.Float``, in
-            spacings of facets.
+        first, second: conjugate semi-axes of the footprint, lists of 2 or 3 ``mi.Float``, in units
+            of UV or of space: spacings may be so many that their fourth power overflows.
+        spacings (mi.Float): of facets in a unit.
 
     Attributes:
         variance (mi.Float): of one probe along each axis, squared spacings.
@@ -84,7 +85,7 @@ class Probes:
         count (mi.Int): of probes, odd.
     """
 
-    def __init__(self, first: list, second: list) -> None:
+    def __init__(self, first: list, second: list, spacings: mi.Float) -> None:
         # The Gram matrix of the axes has the eigenvalues of the covariance.
         a, b, c = (
             sum(x * y for x, y in zip(*pair, strict=True))
@@ -101,11 +102,14 @@ class Probes:
         area = dr.sqrt(sum(dr.square(x) for x in crosses))
         area = dr.maximum(area, major / MAX_ANISOTROPY)
         ratio = dr.select(area > 0, major / dr.select(area > 0, area, 1), 1)
+        area = area * dr.square(spacings)
         self.variance = dr.select(ratio > ROUND, ROUND * area / ratio, area)
         self.half = half_number(dr.maximum(ratio / ROUND, 1))
         self.count = 2 * mi.Int(dr.ceil(self.half - 0.5)) + 1
         # The eigenvector (x, y) of the Gram matrix gives the major axis x·first + y·second.
         x, y = dr.select(a >= c, root + difference, b), dr.select(a >= c, b, root - difference)
+        unit = dr.rcp(dr.select(major > 0, major, 1))  # squares of small numbers vanish
+        x, y = x * unit, y * unit
         axis = [dr.fma(x, p, y * q) for p, q in zip(first, second, strict=True)]
         squared = sum(dr.square(p) for p in axis)
         several = (self.count > 1) & (squared > 0)
