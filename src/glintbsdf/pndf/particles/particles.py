@@ -91,7 +91,7 @@ class Seen:
             axes = tuple(self.place.tangent(v) for v in (query.footprint.du, query.footprint.dv))
         spacings = mi.Float(scale)
         self.spacing = dr.rcp(spacings)
-        self.probes = Probes(*(list(axis) for axis in axes), spacings)
+        self.probes = Probes(list(axes[0]), list(axes[1]), spacings)
         self.step = skewed(self.probes.step)
         self.level = self.probes.level()
         self.fine, share = fade(self.level)
