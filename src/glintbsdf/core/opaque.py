@@ -26,3 +26,24 @@ def stored(kind: type, values: np.ndarray):
     happened to put the array.
     """
     return kind(aligned(values))
+
+
+def joined(levels: list[list]) -> list:
+    """The arrays of all levels one after the other, for each channel, with their derivatives.
+
+    ``levels``: lists of one array per channel, all of a level having one size. Unlike
+    ``dr.concat``, this writes no size into kernels; nor do kernels depend on which sizes are alike.
+    """
+    kind = type(levels[0][0])
+    total = sum(dr.width(level[0]) for level in levels)
+    channels = [dr.zeros(kind, total) for _ in levels[0]]
+    dr.eval(channels)
+    index_type, first = dr.uint32_array_t(kind), 0
+    for level in levels:
+        width = dr.width(level[0])
+        index = dr.arange(index_type, width) + dr.opaque(index_type, first)
+        for channel, values in zip(channels, level, strict=True):
+            dr.scatter(channel, values, index, mode=dr.ReduceMode.Permute)
+        dr.eval(channels)
+        first += width
+    return channels

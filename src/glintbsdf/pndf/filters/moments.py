@@ -32,7 +32,7 @@ import mitsuba as mi
 
 from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.core.memory import NOTABLE
-from glintbsdf.core.opaque import opaque
+from glintbsdf.core.opaque import joined, opaque
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
@@ -526,8 +526,7 @@ class MomentPyramid:
 
         ``windows``: the part of each level, see :meth:`choose_windows`.
         """
-        channels = [dr.concat(parts) for parts in zip(*levels, strict=True)]
-        dr.eval(channels)
+        channels = joined(levels)
         for level in levels:  # a large map then never has three copies
             level.clear()
         self.channels = len(channels)

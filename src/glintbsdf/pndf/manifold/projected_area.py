@@ -639,9 +639,10 @@ def mean_over_points(
 def has_degenerate_triangles(mesh: TexelMesh) -> bool:
     """Whether any triangle of a mesh is replaced by an equilateral one."""
     with dr.suspend_grad():
-        columns = mesh.lattice.x.quads
-        index = dr.arange(mi.UInt32, columns * mesh.lattice.y.quads)
-        n0, n1, n2, n3 = mesh.quad_normals(mi.Int(index // columns), mi.Int(index % columns))
+        index = dr.arange(mi.UInt32, mesh.lattice.x.quads * mesh.lattice.y.quads)
+        columns = mi.UInt32(mesh.lattice.x.count)
+        row = index // columns
+        n0, n1, n2, n3 = mesh.quad_normals(mi.Int(row), mi.Int(index - row * columns))
         any_of = is_degenerate(n0, (n1, n2), mesh.epsilon)
         any_of |= is_degenerate(n3, (n1, n2), mesh.epsilon)
         return bool(dr.any(any_of))
