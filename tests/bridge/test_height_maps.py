@@ -9,24 +9,12 @@ import pytest
 
 from glintbsdf.check import suite
 from glintbsdf.check.suite import View
+from tests.small_scenes import write_plates
 
 SIZE = 64
 SLOPES = np.array([0.2, 0.1])  # along columns and rows, texels per texel
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE]
 RAMP = (SLOPES[0] * COLUMNS + SLOPES[1] * ROWS).astype(np.float32)
-
-PLATE = """v -1 -1 0
-v 1 -1 0
-v 1 1 0
-v -1 1 0
-vt {0} 0
-vt {1} 0
-vt {1} 1
-vt {0} 1
-vn 0 0 1
-f 1/1/1 2/2/1 3/3/1
-f 1/1/1 3/3/1 4/4/1
-"""
 
 PLUGINS = {
     "glint_filtered": {"alpha": 0.01},
@@ -41,8 +29,7 @@ def tensor(height: np.ndarray) -> mi.TensorXf:
 
 def surfaces(folder) -> dict:
     """Shapes and transforms of UV on which texels are turned, mirrored or stretched."""
-    for name, ends in (("plate", (0, 1)), ("mirrored", (1, 0))):
-        (folder / f"{name}.obj").write_text(PLATE.format(*ends))
+    write_plates(folder)
     transform = mi.ScalarTransform4f
     mesh = {"type": "obj", "filename": str(folder / "plate.obj")}
     return {

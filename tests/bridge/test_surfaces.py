@@ -11,30 +11,18 @@ import pytest
 
 from glintbsdf import maps
 from glintbsdf.bridge import surfaces
+from tests.small_scenes import write_plates
 
 NORMALS = maps.isotropic(32, alpha=0.1, correlation_length=5).normals
 VECTORS = np.dstack((NORMALS, np.sqrt(1 - (NORMALS**2).sum(axis=2))))
 OPPOSITE = VECTORS * np.float32((1, -1, 1))
 
-PLATE = """v -1 -1 0
-v 1 -1 0
-v 1 1 0
-v -1 1 0
-vt {0} 0
-vt {1} 0
-vt {1} 1
-vt {0} 1
-vn 0 0 1
-f 1/1/1 2/2/1 3/3/1
-f 1/1/1 3/3/1 4/4/1
-"""
 BARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n"
 
 
 @pytest.fixture
 def folder(tmp_path):
-    (tmp_path / "plate.obj").write_text(PLATE.format(0, 1))
-    (tmp_path / "mirrored.obj").write_text(PLATE.format(1, 0))
+    write_plates(tmp_path)
     (tmp_path / "bare.obj").write_text(BARE)
     return tmp_path
 

@@ -19,34 +19,9 @@ from glintbsdf import NormalMap, maps
 from glintbsdf.cli import entry as cli
 from glintbsdf.examples import EXAMPLES
 from glintbsdf.scene import rendering, units
+from tests.small_scenes import square, write_heights
 
-SCENE = """<scene version="3.0.0">
-    <default name="size" value="16"/>
-    <default name="spp" value="16"/>
-    <default name="sampler" value="independent"/>
-    <default name="spread" value="0"/>
-    <integrator type="path"><integer name="max_depth" value="2"/></integrator>
-    <sensor type="perspective">
-        <float name="fov" value="30"/>
-        <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="$size"/>
-            <integer name="height" value="$size"/>
-            <rfilter type="box"/>
-        </film>
-        <sampler type="$sampler"><integer name="sample_count" value="$spp"/></sampler>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="rectangle">
-        <bsdf type="twosided">
-            <bsdf type="glint_manifold">
-                <string name="filename" value="map.exr"/>
-                <float name="pixel_spread" value="$spread"/>
-            </bsdf>
-        </bsdf>
-    </shape>
-</scene>
-"""
+SCENE = square()
 
 
 @pytest.fixture
@@ -54,9 +29,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder, with a small scene and its map in it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(SCENE)
-    heights = np.random.default_rng(1).random((16, 16, 1), dtype=np.float32)
     mi.set_variant("scalar_rgb")
-    mi.Bitmap(heights).write("map.exr")
+    write_heights(tmp_path / "map.exr")
     return tmp_path
 
 
@@ -121,7 +95,7 @@ def test_definitions_reach_the_scene(run, folder):
 
 def test_aov_images(run, folder):
     text = SCENE.replace(
-        '<integrator type="path"><integer name="max_depth" value="2"/>',
+        '<integrator type="$integrator"><integer name="max_depth" value="$depth"/>',
         '<integrator type="aov"><string name="aovs" value="dd:depth"/><integrator type="path"/>',
     )
     (folder / "aov.xml").write_text(text)

@@ -24,32 +24,13 @@ from glintbsdf.scene.cluster import Cluster, ClusterError, Keys
 from glintbsdf.scene.package import Job, Package
 from glintbsdf.scene.passes import Tile
 from glintbsdf.scene.storage import Checkpoint
+from tests.small_scenes import ball, square, write_heights
 
 pytest.importorskip("distributed")
 # Dask leaves sockets and loops to the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-SCENE = """<scene version="3.0.0">
-    <default name="size" value="16"/>
-    <default name="integrator" value="path"/>
-    <integrator type="$integrator"><integer name="max_depth" value="4"/></integrator>
-    <sensor type="perspective">
-        <float name="fov" value="30"/>
-        <transform name="to_world"><lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="$size"/>
-            <integer name="height" value="$size"/>
-        </film>
-        <sampler type="independent"><integer name="sample_count" value="48"/></sampler>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="sphere"><point name="center" x="1" y="1" z="0"/><float name="radius" value="0.4"/>
-        <bsdf type="diffuse"/></shape>
-    <shape type="rectangle">
-        <bsdf type="glint_manifold"><string name="filename" value="map.exr"/></bsdf>
-    </shape>
-</scene>
-"""
+SCENE = square(ball(1, 1, 0, radius=0.4), origin="0,1,4", rfilter="gaussian", spp=48, depth=4)
 SPP = 48  # in units of 2 samples per pixel
 UNITS = 24
 
@@ -60,8 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> Pat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(units, "FEWEST", 512)
     (tmp_path / "scene.xml").write_text(SCENE)
-    heights = np.random.default_rng(1).random((16, 16, 1), dtype=np.float32)
-    mi.Bitmap(heights).write("map.exr")
+    write_heights(tmp_path / "map.exr")
     return tmp_path
 
 

@@ -12,42 +12,12 @@ import pytest
 from glintbsdf import maps
 from glintbsdf.cli import entry as cli
 from glintbsdf.scene import inspection, rendering
+from tests.small_scenes import ball, square
 
 SIZE = 128
 
 # A square of 2 × 2 seen from above through a window: its middle eighth, so that a pixel is a texel.
-SCENE = """<scene version="3.0.0">
-    <default name="plugin" value="glint_manifold"/>
-    <default name="integrator" value="path"/>
-    <default name="depth" value="2"/>
-    <default name="scale" value="1"/>
-    <integrator type="$integrator"><integer name="max_depth" value="$depth"/></integrator>
-    <sensor type="perspective">
-        <float name="fov" value="3.5801"/>
-        <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="16"/>
-            <integer name="height" value="16"/>
-            <rfilter type="box"/>
-        </film>
-        <sampler type="independent"><integer name="sample_count" value="64"/></sampler>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="rectangle">
-        <bsdf type="twosided">
-            <bsdf type="$plugin" id="metal">
-                <string name="filename" value="map.exr"/>
-                <transform name="to_uv"><scale value="$scale"/></transform>
-            </bsdf>
-        </bsdf>
-    </shape>
-    <shape type="sphere">
-        <point name="center" x="0.45" y="0" z="0.3"/>
-        <float name="radius" value="0.25"/>
-        <bsdf type="diffuse"/>
-    </shape>
-</scene>
-"""
+SCENE = square(ball(0.45, 0, 0.3, radius=0.25), fov=3.5801, spp=64)
 
 
 @pytest.fixture
