@@ -60,21 +60,32 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
    - |int|
    - Another number gives another map. (Default: 0)
 
+ * - representation
+   - |string|
+   - What answers: :monosp:`lobes`, the MIP-mapped lobes of the paper; or :monosp:`exact`, the
+     elements of :ref:`glint_elements <bsdf-glint_elements>` on the large map, and tables for large
+     footprints, which takes :monosp:`wrap_mode` :monosp:`repeat`. (Default: :monosp:`lobes`)
+
+ * - max_error
+   - |float|
+   - With :monosp:`exact`: relative L1 error of the P-NDF that tables may have, on average over the
+     map; 0 for no tables. (Default: 0.05)
+
  * - clusters
    - |int|
-   - Lobes of each grid of every MIP level, from 1 to 1024: 16 for speed, 64 for scratches.
-     (Default: 32)
+   - With :monosp:`lobes`: lobes of each grid of every MIP level, from 1 to 1024: 16 for speed, 64
+     for scratches. (Default: 32)
 
  * - normal_weight
    - |float|
-   - Weight of normals against positions where lobes are clustered: of standard deviations in the
-     sample, against those in the grid. (Default: 8)
+   - With :monosp:`lobes`: weight of normals against positions where lobes are clustered: of
+     standard deviations in the sample, against those in the grid. (Default: 8)
 
  * - lod_scale
    - |float|
-   - Factor :math:`C_P` of the MIP level :math:`\lambda = C_P \log_2 P` for a footprint that covers
-     :math:`P` texels, two standard deviations by two. With 0.5, grids are as wide as the footprint;
-     less is more accurate and slower. (Default: 0.5)
+   - With :monosp:`lobes`: factor :math:`C_P` of the MIP level :math:`\lambda = C_P \log_2 P` for a
+     footprint that covers :math:`P` texels, two standard deviations by two. With 0.5, grids are as
+     wide as the footprint; less is more accurate and slower. (Default: 0.5)
 
  * - sigma_r
    - |float|
@@ -84,11 +95,12 @@ Glints of a large map made from a small sample (:monosp:`glint_mip`)
 
  * - masking
    - |string|
-   - Masking and shadowing: :monosp:`footprint`, by the lobes under the footprint, over the plane of
-     their mean slope, so that no place reflects more light than it receives. All lobes are visited
-     once more for it, which doubles the time of a query. :monosp:`beckmann`: that of a level
-     Beckmann surface as rough as the whole sample, with which a place that leans towards the viewer
-     reflects more than it receives. Or :monosp:`none`. (Default: :monosp:`footprint`)
+   - Masking and shadowing: :monosp:`footprint`, by the facets under the footprint, over the plane
+     of their mean slope, so that no place reflects more light than it receives. All lobes are
+     visited once more for it, which doubles the time of a query; with :monosp:`exact` it takes 34
+     to 144 points of a footprint that is larger than a few texels. :monosp:`beckmann`: that of a
+     level Beckmann surface as rough as the whole sample, with which a place that leans towards the
+     viewer reflects more than it receives. Or :monosp:`none`. (Default: :monosp:`footprint`)
 
  * Shared: footprint_sigma, pixel_spread, material, eta, k, int_ior, ext_ior, specular_reflectance
 
@@ -122,6 +134,17 @@ P-NDF differs from that of :ref:`glint_elements <bsdf-glint_elements>` on the sa
 and 9 % (relative L1) on a map of Gaussian bumps, and by 7 to 10 % on one of scratches. At 64 texels
 a query takes a seventh of the time that the elements take, at 16 and below two to four times as
 long; where most of the surface reflects nothing, the elements are faster still.
+
+*The map exactly.* Every texel of the large map is one of the sample's, seen through the patch that
+owns it. With :monosp:`representation` :monosp:`exact`, footprints of a few texels sum the elements
+of the large map's texels; larger ones walk inverted lists of the sample's elements, once for every
+patch under them, and the texels on seams one by one. Both are the P-NDF of ``glint_elements`` on
+the map that ``synthesise`` writes, to 1e-4, and so is the sampler. Where the footprint is so large
+that its error is allowed, tables of blocks of the sample's texels serve, each with the share of it
+that a patch owns; from some size on, one table of the whole map. Within a bin of these tables,
+1/128 of the range of the sample's normals, D is constant. The error is measured when the tables are
+built, at places all over the map: over a seam it is larger than the average, inside a patch it is
+smaller. Lights are sampled, not integrated, in both representations.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV
@@ -157,7 +180,10 @@ from glintbsdf.bridge.parameters import Parameters
 from glintbsdf.bridge.registration import register_plugin
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.maps.normalmap import MapShape
-from glintbsdf.pndf import Mip
+from glintbsdf.pndf import PNDF, Mip, Patches
+
+#: What answers, by the name of the representation.
+REPRESENTATIONS: dict[str, type[PNDF]] = {"lobes": Mip, "exact": Patches}
 
 
 class GlintMip(GlintBSDF):
@@ -166,21 +192,27 @@ class GlintMip(GlintBSDF):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         parameters = Parameters(props)
-        sizes = {"output_size": 4096, "patch_size": 64, "clusters": 32, "seed": 0}
+        sizes = {"output_size": 4096, "patch_size": 64, "seed": 0}
         self.normal_map = parameters.normal_map()
         self.options = {name: parameters.whole(name, x) for name, x in sizes.items()} | {
             "overlap": parameters.whole("overlap", None),
-            "lod_scale": parameters.number("lod_scale", 0.5),
             "balance": parameters.number("balance", 0.9),
             "sigma_r": parameters.number("sigma_r", 0.005),
-            "normal_weight": parameters.number("normal_weight", 8.0),
             "owner": self.owner,
         }
+        self.kind = REPRESENTATIONS[parameters.choice("representation", "lobes", REPRESENTATIONS)]
+        lobes = {
+            "clusters": parameters.whole("clusters", 32),
+            "lod_scale": parameters.number("lod_scale", 0.5),
+            "normal_weight": parameters.number("normal_weight", 8.0),
+        }
+        max_error = parameters.number("max_error", 0.05)
+        self.options |= lobes if self.kind is Mip else {"max_error": max_error}
         self.masking_name = parameters.choice("masking", Mip.maskings[0], Mip.maskings)
         self.finish()
 
-    def create(self, domain: Domain | None) -> Mip:
-        return Mip(self.normal_map, **self.options)
+    def create(self, domain: Domain | None) -> PNDF:
+        return self.kind(self.normal_map, **self.options)
 
     @property
     def map_shape(self) -> MapShape:

@@ -64,7 +64,7 @@ STIFF_SAMPLES = {
     "scratched": maps.scratched(64, length=30),
     "smallest": maps.isotropic(PATCH + 1, alpha=0.15, seed=2),
 }
-DENSITY_TESTS = len(VIEWS) + 2 * len(STIFF_SAMPLES)
+DENSITY_TESTS = len(VIEWS) + 2 * len(STIFF_SAMPLES) + 5
 
 
 # A square within the disk that holds all normals of the samples and five σ_r more.
@@ -79,6 +79,42 @@ BOUNDS = ((-0.7, -0.7), (0.7, 0.7))
 @pytest.mark.parametrize("name", VIEWS)
 def test_density(variant, name):
     suite.check_chi2(load(), VIEWS[name], BOUNDS, DENSITY_TESTS, samples=50_000, res=17)
+
+
+def load_exact(**parameters) -> mi.BSDF:
+    """The exact representation, with tables for all but the smallest footprints."""
+    return load(representation="exact", max_error=0.1, **parameters)
+
+
+# By elements of the quads, by the tables of their blocks, and of the whole map
+@pytest.mark.parametrize(
+    "name", ["texels", "on a seam", "on the edge", "grids on a seam", "cells, integer level"]
+)
+def test_density_of_the_exact_map(variant, name):
+    bsdf = load_exact()
+    suite.check_chi2(bsdf, VIEWS[name], BOUNDS, DENSITY_TESTS, samples=50_000, res=17)
+    suite.check_eval_pdf(bsdf, VIEWS[name])
+    suite.check_weights(bsdf, VIEWS[name])
+
+
+def test_the_exact_map_in_extreme_and_oblique_views(variant):
+    for seen in EXTREME_VIEWS.values():
+        suite.check_finite(load_exact(sigma_r=1e-3), seen)
+    bsdf = load_exact(masking="footprint")
+    for name in ("texels", "cells, integer level", "whole map"):
+        seen = replace(VIEWS[name], wi=(-1, -1, 0.2))
+        suite.check_furnace(bsdf, seen, count=4000)
+        suite.check_adjoint(bsdf, seen)
+
+
+def test_each_representation_has_parameters_of_its_own(variant):
+    assert type(load_exact().pndf).__name__ == "Patches"
+    for changes, parameter in (
+        ({"max_error": -0.1}, "max_error"),
+        ({"representation": "lists"}, "representation"),
+        ({"wrap_mode": "mirror"}, "representation"),
+    ):
+        suite.check_rejects({**describe(), "representation": "exact"}, changes, parameter)
 
 
 @pytest.mark.parametrize("name", STIFF_SAMPLES)

@@ -154,6 +154,8 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         "output_size": Number(4, 1 << 16, whole=True),
         "patch_size": Number(3, 1 << 15, whole=True),
         "overlap": Number(1, 1 << 14, whole=True),
+        "representation": NAME,
+        "max_error": Number(0, 10),
         "clusters": Number(1, 1024, whole=True),
         "lod_scale": Number(0, 16, below=True),
         "balance": Number(0, 1),

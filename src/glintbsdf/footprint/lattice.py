@@ -133,9 +133,13 @@ class Lattice:
     def corners(self, row, column):
         """Indices of the four vertices n0, n1, n2, n3 of a stored quad (``mi.UInt32``)."""
         row, column = mi.UInt32(row), mi.UInt32(column)
-        upper, lower = ((i >> 1) * self.row_pitch + ((i & 1) << 2) for i in (row, row + 1))
-        left, right = (((j >> 2) << 3) + (j & 3) for j in (column, column + 1))
-        return upper + left, upper + right, lower + left, lower + right
+        return tuple(self.vertex(i, j) for i in (row, row + 1) for j in (column, column + 1))
+
+    def vertex(self, row, column):
+        """Index of the stored vertex at a row and a column (``mi.UInt32``)."""
+        row, column = mi.UInt32(row), mi.UInt32(column)
+        in_row = ((column >> 2) << 3) + (column & 3)
+        return (row >> 1) * self.row_pitch + ((row & 1) << 2) + in_row
 
     def corner_values(self, vertices, row, column, active):
         """The four ``mi.Vector2f`` at a stored quad's vertices, of the flat array ``vertices``.

@@ -9,6 +9,7 @@ from glintbsdf.pndf.grid.microdetails import Grid
 from glintbsdf.pndf.manifold.clustered import ClusteredManifold
 from glintbsdf.pndf.manifold.exact import Manifold
 from glintbsdf.pndf.manifold.tabulated import TabulatedManifold
+from glintbsdf.pndf.mip.exact import Patches
 from glintbsdf.pndf.mip.mip import Mip
 from glintbsdf.pndf.particles.particles import Particles
 
@@ -22,6 +23,7 @@ __all__ = [
     "Manifold",
     "Mip",
     "Particles",
+    "Patches",
     "TabulatedManifold",
     "PNDF",
     "methods",

@@ -542,33 +542,20 @@ class Elements(Mixture):
         """Build everything that depends on ``data`` and ``sigma_r``, for queries in ``domain``."""
         self.domain = domain
         height, width, _ = self.data.shape
-        self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
-        self.map_cells, self.seeds = (x.cells, y.cells), x.seeds
-        self.variance = (SIGMA_H / self.seeds) ** 2
-        self.origin = tuple(0.5 / axis.cell - 0.5 for axis in self.axes)
-
+        self.place_seeds(height, width)
+        x, y = self.axes
         self.texels = Lattice(height, width, self.wrap_mode)
         self.vertices = dr.ravel(
             dr.gather(mi.Vector2f, self.data.array, mi.UInt32(self.texels.source))
         )
         dr.eval(self.vertices)
         self.element_bytes = 4 * dr.width(self.vertices)
-        self.aligned = self.map_cells == (width, height)
         self.lattice = self.texels
         if not self.aligned:
             clamped = self.wrap_mode == "clamp"
             rows, columns = (axis.inner_cells if clamped else axis.cells for axis in (y, x))
             self.lattice = Lattice(rows, columns, self.wrap_mode)
 
-        # Sorted by the side of the diagonal: elements with the same Jacobian are neighbours, and
-        # :meth:`lobes` makes their distribution once.
-        self.places = sorted(
-            ((u, v) for v in y.places for u in x.places),
-            key=lambda place: side_of_diagonal(*place),
-        )
-        self.anchors = self.places
-        if self.aligned and self.curved:
-            self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
         self.levels = None
         self.lists = None
         if domain is None or not self.all_small(domain.largest):
@@ -579,6 +566,23 @@ class Elements(Mixture):
 
             self.lists = shared(self, make, "lists of elements", *key)
         self.slopes = self.make_slopes() if self.masked else None
+
+    def place_seeds(self, height: int, width: int) -> None:
+        """Set what depends on the size of the map and on the step alone."""
+        self.axes = x, y = SeedAxis(width, self.step), SeedAxis(height, self.step)
+        self.map_cells, self.seeds = (x.cells, y.cells), x.seeds
+        self.variance = (SIGMA_H / self.seeds) ** 2
+        self.origin = tuple(0.5 / axis.cell - 0.5 for axis in self.axes)
+        self.aligned = self.map_cells == (width, height)
+        # Sorted by the side of the diagonal: elements with the same Jacobian are neighbours, and
+        # :meth:`lobes` makes their distribution once.
+        self.places = sorted(
+            ((u, v) for v in y.places for u in x.places),
+            key=lambda place: side_of_diagonal(*place),
+        )
+        self.anchors = self.places
+        if self.aligned and self.curved:
+            self.anchors = [ANCHORS[side_of_diagonal(*place)][0] for place in self.places]
 
     def make_slopes(self) -> MomentPyramid | None:
         if self.lists is None:

@@ -342,11 +342,12 @@ class QuadLists:
                 for k in (columns.place(first), columns.place(last) + 1)
             )
 
-        def quad_of(entry, row, found):
-            quad = mi.Int(self.entries[entry, found])
-            return row + (quad & (BLOCK - 1)), quad >> SHIFT
+        return walk(self.lattice, SHIFT, kernel, run_of, self.quad_of, add, active, zero)
 
-        return walk(self.lattice, SHIFT, kernel, run_of, quad_of, add, active, zero)
+    def quad_of(self, entry, row, active) -> tuple[mi.Int, mi.Int]:
+        """Row and column of the quad of an entry, whose row of blocks begins at ``row``."""
+        quad = mi.Int(self.entries[entry, active])
+        return row + (quad & (BLOCK - 1)), quad >> SHIFT
 
     # --------------------------------------------------------------------------------------------
     #  Building

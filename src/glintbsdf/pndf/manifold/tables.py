@@ -232,14 +232,19 @@ def within_row(p, q):
 class Bins:
     """A grid of bins over a rectangle of projected normals.
 
+    ``bounds`` (lower, upper): the rectangle; ``size``: extents of a bin, :data:`BINS` of them along
+    each axis by default.
+
     Attributes:
         lower, size (float64 (2,)): corner of the grid, and extents of a bin.
         columns, rows (int): bins along x and y.
     """
 
-    def __init__(self, bounds) -> None:
+    def __init__(self, bounds, size: np.ndarray | None = None) -> None:
         self.lower, upper = (np.asarray(v, np.float64) for v in bounds)
-        self.size = np.maximum((upper - self.lower) / BINS, MIN_BIN)
+        if size is None:
+            size = np.maximum((upper - self.lower) / BINS, MIN_BIN)
+        self.size = size
         shape = np.maximum(np.ceil((upper - self.lower) / self.size - 1e-6), 1)
         self.columns, self.rows = (int(n) for n in shape)
         # Opaque values: one kernel serves all maps.
