@@ -9,6 +9,8 @@ import json
 import pytest
 from rich.console import Console
 
+from glintbsdf.check import bounds
+
 ROWS = (("leadr", "white noise"), ("manifold", "3×5, mirror"), ("grid", "none"))
 
 
@@ -84,13 +86,13 @@ def test_nan_breaks_every_bound(stability, column):
     figures = value[0] if isinstance(value, list) else value
     spoilt = dict.fromkeys(figures, float("nan"))
     result = BROKEN[column] | {name: [spoilt] if isinstance(value, list) else spoilt, "errors": {}}
-    assert stability.Judge(10).cells(result)[column].broken
+    assert bounds.Judge(10).cells(result)[column].broken
 
 
 def test_unresolved_values_are_not_judged(stability):
     result = BROKEN["float64"] | BROKEN["NaN"] | {"errors": {}, "resolved": False}
-    cells = stability.Judge(10).cells(result)
-    assert cells["float64"] == stability.Cell("(2.0e-03)") and cells["NaN"].broken
+    cells = bounds.Judge(10).cells(result)
+    assert cells["float64"] == bounds.Cell("(2.0e-03)") and cells["NaN"].broken
 
 
 def test_failures_are_named(stability, tmp_path):
