@@ -26,7 +26,7 @@ def shared(of: Any, make: Callable[[], Structure], *key: Hashable) -> Structure:
     """
     if of.changed or of.normal_map is None:
         return make()
-    key = (mi.variant(), of.normal_map.content_hash, *key)
+    key = (mi.variant(), mi.Float, of.normal_map.content_hash, *key)
     found = _made.get(key)
     if found is None:
         found = _made[key] = make()
