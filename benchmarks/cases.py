@@ -99,45 +99,6 @@ CASES = [
     synthesised("isotropic patches", "isotropic"),
 ]
 
-#: Side of the stiff maps, texels: the smallest one with clusters.
-STIFF_SIZE = 32
-
-
-def step_edge() -> NormalMap:
-    """Two planes: all triangles are degenerate, and those across the edge are very long."""
-    normals = np.zeros((STIFF_SIZE, STIFF_SIZE, 2))
-    half = STIFF_SIZE // 2
-    normals[:, :half], normals[:, half:] = (-0.3, 0), (0.6, 0.1)
-    return NormalMap(normals)
-
-
-def rank_one() -> NormalMap:
-    """Grooves: normals on a line, which vary in one direction only; every Jacobian is singular."""
-    wave = 0.6 * np.sin(2 * np.pi * np.arange(STIFF_SIZE) / STIFF_SIZE * 3)
-    normals = wave[None, :, None] * np.array([0.8, 0.6])
-    return NormalMap(np.broadcast_to(normals, (STIFF_SIZE, STIFF_SIZE, 2)))
-
-
-def white_noise(shape: tuple[int, int], wrap_mode: str = "repeat") -> NormalMap:
-    """Independent normals, uniform over the disk up to slopes of 200."""
-    rng = np.random.default_rng(1)
-    radius, angle = np.sqrt(rng.random(shape)), rng.uniform(0, 2 * np.pi, shape)
-    normals = 0.99999 * radius * np.stack([np.cos(angle), np.sin(angle)])
-    return NormalMap(np.moveaxis(normals, 0, -1), wrap_mode)
-
-
-STIFF_MAPS: dict[str, Callable[[], NormalMap]] = {
-    "isotropic": partial(MAPS["isotropic"], STIFF_SIZE),
-    "flat": partial(maps.flat, STIFF_SIZE),
-    "tilted": partial(maps.tilted, STIFF_SIZE, 0.5, 0.3),
-    "rank-one": rank_one,
-    "step edge": step_edge,
-    "white noise": partial(white_noise, (STIFF_SIZE, STIFF_SIZE)),
-    "single texel": partial(maps.tilted, 1, 0.3, 1.0),
-    "3×5, mirror": lambda: NormalMap(maps.isotropic((3, 5), 0.4).normals, "mirror"),
-    "1×17, clamp": partial(white_noise, (1, 17), "clamp"),
-}
-
 # --------------------------------------------------------------------------------------------------
 #  Footprints and queries
 # --------------------------------------------------------------------------------------------------

@@ -25,12 +25,12 @@ from benchmarks.cases import (
     grid_of_normals,
     maps_of,
     queries,
-    white_noise,
 )
 from benchmarks.harness import Run, family
 from benchmarks.measures import pndf as errors
 from benchmarks.methods import SIGMA_R
 from glintbsdf import NormalMap
+from glintbsdf.check.stiff import white_noise
 from glintbsdf.maps.quilting import lobe_features, synthesise
 from glintbsdf.pndf import Elements, Mip
 

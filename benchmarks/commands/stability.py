@@ -27,7 +27,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.cases import STIFF_SIZE
 from benchmarks.harness import (
     VARIANT,
     Store,
@@ -36,10 +35,19 @@ from benchmarks.harness import (
     open_store,
     output_option,
 )
-from benchmarks.methods import NARROWEST_LOBE, NO_MAP, STIFF, VERTICAL, WIDTHS, Stiff, stiff_map
 from benchmarks.report import page
 from glintbsdf.check import densities, fuzz, robustness
 from glintbsdf.check.bounds import SIGNIFICANCE, Judge
+from glintbsdf.check.stiff import (
+    NARROWEST_LOBE,
+    NO_MAP,
+    STIFF,
+    STIFF_SIZE,
+    VERTICAL,
+    WIDTHS,
+    Stiff,
+    stiff_map,
+)
 from glintbsdf.check.suite import View
 from glintbsdf.cli.entry import one_line
 from glintbsdf.core.interruption import interruptible

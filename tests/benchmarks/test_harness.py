@@ -89,10 +89,11 @@ def test_every_command_has_help_and_a_place_on_a_page(name):
 
 def test_methods_of_the_register_take_part():
     from benchmarks import methods
+    from glintbsdf.check import stiff
     from glintbsdf.pndf import methods as registered
 
     for entry in registered().values():
         assert entry.plugin in {method.plugin["type"] for method in methods.METHODS}
-        assert entry.plugin in {stiff.plugin for stiff in methods.STIFF.values()}
+        assert entry.plugin in {setting.plugin for setting in stiff.STIFF.values()}
     names = [method.name for method in methods.METHODS]
     assert len(set(names)) == len(names)

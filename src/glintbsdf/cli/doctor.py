@@ -20,6 +20,8 @@ _PACKAGES = (
     "scipy",
     "OpenEXR",
     "scikit-image",
+    "matplotlib",
+    "tifffile",
     "click",
     "rich",
     "platformdirs",
