@@ -95,7 +95,7 @@ def test_projected_areas_are_near_those_of_the_elements(exact):
 
 @pytest.fixture
 def tabulated(variant) -> tuple[Patches, Elements]:
-    patches = make(max_error=0.1)
+    patches = make(max_error=0.25)
     return patches, Elements(patches.normal_map, sigma_r=SIGMA_R)
 
 
@@ -112,10 +112,10 @@ def test_tables_are_near_the_elements_and_integrate_to_one(tabulated, sigma, lev
         # Of points in bins of another size
         assert abs(ours.sum() * area - 1) < 0.01
     # Most of these places are on seams, and D is compared at points, not averaged over the bins of
-    # the tables: measured 0.071 and 0.078, where 0.038 and 0.1 are predicted for the average place
+    # the tables: measured 0.071 and 0.078, where 0.079 and 0.2 are predicted for the average place
     predicted = float(patches.relative_error(rotated((0.4, 0.3), sigma))[0])
-    assert np.mean(errors) < 2 * predicted
-    assert predicted <= 0.1
+    assert np.mean(errors) < 1.2 * predicted
+    assert predicted <= 0.25
 
 
 def test_the_largest_footprints_see_the_whole_map(tabulated):

@@ -75,8 +75,8 @@ SIGMAS, PLACES = (2.0, 3.0, 4.5, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0), 16
 #: The smallest map, texels along an axis, at which errors can be measured.
 SMALLEST = 32
 
-#: What is predicted over what is measured against the map's mesh: its elements differ a little.
-MARGIN = 1.2
+#: What is predicted over what is measured against the map's mesh, as its elements differ from it.
+MARGIN = 2.5
 
 
 # ------------------------------------------------------------------------------------------------
