@@ -30,7 +30,6 @@ from glintbsdf.cli.render_options import options as render_options
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.examples import EXAMPLES
-from glintbsdf.maps import quilting as synthesis
 from glintbsdf.maps.normalmap import MAP_TYPES, WRAP_MODES, NormalMap
 from glintbsdf.scene import inspection, rendering
 from glintbsdf.scene import sequence as frames
@@ -473,10 +472,12 @@ def synthesise(
 
     The result is the map of glint_mip with the same parameters. That plugin does not need the file.
     """
+    from glintbsdf.maps.quilting import synthesise as make_map
+
     _refuse_same(output, sample)
     normal_map = NormalMap.load(sample, map_type, height_scale, wrap_mode, "synthesise")
     with rendering.replacing(output) as unfinished:
-        made = synthesis.synthesise(normal_map, **options, toroidal=wrap_mode == "repeat")
+        made = make_map(normal_map, **options, toroidal=wrap_mode == "repeat")
         made.write(unfinished)
     click.echo(made)
     click.echo(output)

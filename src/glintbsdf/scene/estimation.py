@@ -15,7 +15,8 @@ from glintbsdf.core.progress import duration
 from glintbsdf.scene import passes, rendering
 from glintbsdf.scene.passes import Tile
 
-#: Numbers of pixels that are tried one after the other, until one takes so many seconds.
+#: Numbers of pixels that are tried one after the other, until one takes so many seconds. A
+#: rendering that is very short by the first trial needs no other.
 TRIED, ENOUGH = (64, 1024), 0.2
 
 #: Seconds from which on an estimate is worth telling.
@@ -55,14 +56,14 @@ def estimate(renderer: rendering.Renderer, seed: int = 0) -> Estimate | None:
     remedies = sorted({f"{bsdf.owner}: {text}" for bsdf in bsdfs for text in bsdf.remedies()})
     remedies.append("--until-error or --time-limit, which end with what is done")
     nbytes = sum(sum(bsdf.parts().values()) for bsdf in bsdfs)
-    per_sample = 0.0
+    expected = 0.0
     for pixels in TRIED:
         tile = column_of(plan.film, pixels)
         seconds = seconds_of(renderer, tile, seed)
-        per_sample = seconds / tile.pixels
-        if seconds >= ENOUGH:
+        expected = seconds / tile.pixels * plan.film.pixels * plan.spp
+        if seconds >= ENOUGH or 10 * expected < LONG:
             break
-    return Estimate(per_sample * plan.film.pixels * plan.spp, nbytes, remedies)
+    return Estimate(expected, nbytes, remedies)
 
 
 def column_of(film: Tile, pixels: int) -> Tile:
