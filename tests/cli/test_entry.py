@@ -16,6 +16,8 @@ import OpenEXR
 import pytest
 
 from glintbsdf import NormalMap, maps
+from glintbsdf.check.comparison import Comparison
+from glintbsdf.check.reference import BinnedPNDF
 from glintbsdf.cli import entry as cli
 from glintbsdf.examples import EXAMPLES
 from glintbsdf.scene import rendering, units
@@ -420,6 +422,26 @@ def test_pndf_without_a_map(run, folder):
     assert 0.9 < mass < 1.01  # nearly all normals are on the grid
     _, output, _ = run("pndf", "--type", "glint_grid", "-D", "density=4", *seen)
     assert "draws from another distribution" in output
+
+
+@pytest.mark.parametrize(
+    ("difference", "predicted", "words"),
+    [
+        (0.10, 0.0, "within the noise"),
+        (0.15, 0.1, "no more than the method predicts, 0.1"),
+        (0.15, 0.0, "more than the noise"),
+    ],
+)
+def test_the_verdict_of_a_comparison(difference, predicted, words):
+    """Where noise makes about 8 %."""
+    density, error = np.full((8, 8), 2.0), np.full((8, 8), 0.2)
+    reference = BinnedPNDF(density, error, ((0.0, 0.0), (1.0, 1.0)))
+    sign = np.where(np.indices((8, 8)).sum(axis=0) % 2, 1, -1)
+    compared = Comparison(
+        "", density * (1 + difference * sign), 0 * error, reference, 1, 1.0, None, maps.flat(2),
+        predicted,
+    )  # fmt: skip
+    assert np.isclose(compared.difference, difference) and words in compared.verdict
 
 
 def test_pndf_says_when_a_method_differs(run, folder):
