@@ -95,3 +95,11 @@ def _flush_drjit() -> Iterator[None]:
     if mi.variant() is not None and not mi.variant().startswith("scalar"):
         gc.collect()
         dr.flush_malloc_cache()
+
+
+@pytest.fixture
+def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is told about time, which a busy machine would have among the errors."""
+    monkeypatch.setattr("glintbsdf.core.progress._FIRST_LINE", 1e9)
+    monkeypatch.setattr("glintbsdf.core.progress._LONG", 1e9)
+    monkeypatch.setattr("glintbsdf.scene.estimation.LONG", 1e9)

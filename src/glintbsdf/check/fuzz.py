@@ -465,6 +465,12 @@ def _activate(variant: str) -> None:
 
     if mi.variant() != variant:
         mi.set_variant(variant)
+
+
+def _hide_warnings() -> None:
+    """Show only errors in Mitsuba's log of this process."""
+    import mitsuba as mi
+
     mi.set_log_level(mi.LogLevel.Error)
 
 
@@ -472,6 +478,7 @@ def _work(connection, seed: int, count: int, variant: str, plugins: tuple[str, .
     """A worker process: it receives indices of cases and sends outcomes. Its first message says
     that it is ready."""
     every = _known_cases(seed, count, variant, plugins)
+    _hide_warnings()
     connection.send("ready")
     while (index := connection.recv()) is not None:
         connection.send(outcome(every[index]))

@@ -193,7 +193,10 @@ class ClusterLattice:
         self.first = [0, 0]
         for rows, columns in self.shapes[1:]:
             self.first.append(self.first[-1] + rows * columns)
-        self.tables = [mi.UInt32(v) for v in (self.first[:-1], *zip(*self.shapes, strict=True))]
+        self.tables = [
+            stored(mi.UInt32, np.array(values, np.uint32))
+            for values in (self.first[:-1], *zip(*self.shapes, strict=True))
+        ]
         self.surplus = block - BLOCK if wrap_mode == "clamp" else 0
 
     def cluster(self, row, column, level):
