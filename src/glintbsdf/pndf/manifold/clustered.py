@@ -65,6 +65,9 @@ RUNG = 0.25
 #: is faster.
 FIRST_RUNG = 2
 
+#: Levels of clusters that a kernel looks through come in multiples of this.
+LEVELS_AT_ONCE = 4
+
 #: With the wrap mode clamp, the borders of the stored map are as wide as the largest block. This
 #: block may be at most this share of the map.
 BORDER = 1 / 16
@@ -309,7 +312,10 @@ class Ladder:
         allowed = dr.gather(mi.Float, self.allowed, rung - 1, active)
         largest = dr.gather(mi.UInt32, self.shifts, rung - 1, active)
         result = mi.UInt32(0)
-        for level in range(1, self.levels + 1):
+        # More levels than the map has make no difference, as none of its rungs has them; maps with
+        # some more or less then share a kernel.
+        count = min(LEVELS_AT_ONCE * -(-self.levels // LEVELS_AT_ONCE), self.lattice.levels)
+        for level in range(1, count + 1):
             index, exists = self.lattice.cluster(row, column, level)
             exists = exists & active & (level <= largest)
             residual = dr.gather(mi.Float, self.residuals, index, exists)
