@@ -312,8 +312,9 @@ class Ladder:
         allowed = dr.gather(mi.Float, self.allowed, rung - 1, active)
         largest = dr.gather(mi.UInt32, self.shifts, rung - 1, active)
         result = mi.UInt32(0)
-        # More levels than the map has make no difference, as none of its rungs has them; maps with
-        # some more or less then share a kernel.
+        # The kernel looks through more levels than the map has, so that maps with some more or less
+        # share it. Those that the map has not are masked.
+        largest = dr.minimum(largest, opaque(mi.UInt32, self.levels))
         count = min(LEVELS_AT_ONCE * -(-self.levels // LEVELS_AT_ONCE), self.lattice.levels)
         for level in range(1, count + 1):
             index, exists = self.lattice.cluster(row, column, level)
