@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from glintbsdf.check.comparison import Comparison
 from glintbsdf.footprint.gaussian import Footprint
@@ -53,8 +53,10 @@ def pndf(comparison: Comparison) -> Figure:
         )
         axis.set(title=title, xlabel="normal x", ylabel="normal y")
         degrees = (_inclination, _projection)
-        axis.secondary_xaxis("top", functions=degrees).set_xlabel("degrees")
-        axis.secondary_yaxis("right", functions=degrees)
+        across = axis.secondary_xaxis("top", functions=degrees, xlabel="degrees")
+        across.set_xticks(_inclination_ticks(left, right))
+        up = axis.secondary_yaxis("right", functions=degrees)
+        up.set_yticks(_inclination_ticks(bottom, top))
     figure.colorbar(shown, ax=list(axes[:2]), label="density over the disk", shrink=0.8)
     if has_map:
         draw_footprint(axes[2], comparison.normal_map, comparison.footprint)
@@ -69,6 +71,16 @@ def _inclination(projected: np.ndarray) -> np.ndarray:
 def _projection(degrees: np.ndarray) -> np.ndarray:
     """The inverse of :func:`_inclination`."""
     return np.sin(np.radians(np.clip(degrees, -90, 90)))
+
+
+def _inclination_ticks(low: float, high: float) -> np.ndarray:
+    """Round inclinations in degrees for an axis of projected normals: at most seven, within ±80.
+
+    Beyond 80 degrees, labels have only the last 1.5 % of the disk's radius.
+    """
+    seen = np.clip(_inclination(np.array([low, high])), -80, 80)
+    ticks = MaxNLocator(nbins=6, steps=[1, 2, 3, 5, 10]).tick_values(*seen)
+    return ticks[(ticks >= seen[0]) & (ticks <= seen[1])]
 
 
 def footprint(normal_map: NormalMap, seen: Footprint) -> Figure:
