@@ -40,10 +40,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(capsys, monkeypatch, variant, no_progress):
     """Run the command line; return its exit status, its output and its errors."""
 
-    def run(*arguments: str | Path) -> tuple[int, str, str]:
+    def run(*arguments: str | Path, replaces: bool = False) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["glintbsdf", *map(str, arguments)])
-        if arguments and arguments[0] in ("render", "pndf") and "-m" not in arguments:
+        command = arguments[0] if arguments else ""
+        if command in ("render", "pndf") and "-m" not in arguments:
             sys.argv += ["-m", variant]
+        if command == "render" and not replaces:
+            sys.argv.append("--keep-integrator")
         with pytest.raises(SystemExit) as exit:
             cli.main()
         captured = capsys.readouterr()
@@ -85,6 +88,32 @@ def test_seed_decides_the_image(run, folder):
         images.append(np.array(mi.Bitmap("scene.exr")))
     assert np.array_equal(images[0], images[1])
     assert not np.array_equal(images[0], images[2])
+
+
+def test_glint_path_takes_the_place_of_path_and_says_so(run, folder):
+    status, _, errors = run("render", "scene.xml", "--spp", 1, "-o", "path.exr", replaces=True)
+    assert status == 0
+    assert errors.startswith('Note: "glint_path" renders in place of the integrator "path"')
+    assert "--keep-integrator" in errors and errors.count("\n") == 1
+    own = ["render", "scene.xml", "--spp", 1, "-D", "integrator=glint_path", "-o", "own.exr"]
+    assert run(*own, replaces=True) == (0, "own.exr\n", "")
+    assert np.array_equal(*(np.array(mi.Bitmap(name)) for name in ("path.exr", "own.exr")))
+
+
+def test_integrators_that_are_replaced(variant, folder):
+    """``direct`` becomes a ``glint_path`` of the same depth, without glints nothing is replaced."""
+
+    def found(**parameters: str) -> list[str]:
+        return rendering.integrators_to_replace("scene.xml", parameters)
+
+    assert found() == ["path"] and found(integrator="direct") == ["direct"]
+    assert found(integrator="volpath") == found(plugin="roughconductor") == []
+    node = mi.parser.SceneNode()
+    node.props = mi.Properties("direct")
+    node.props["hide_emitters"], node.props["emitter_samples"] = True, 4
+    rendering.replace_integrator(node)
+    assert node.props.plugin_name() == "glint_path"
+    assert dict(node.props.items()) == {"hide_emitters": True, "max_depth": 2}
 
 
 def test_definitions_reach_the_scene(run, folder):

@@ -45,8 +45,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def run(variant, no_progress):
     def run(*arguments: object):
-        return CliRunner().invoke(entry.commands, ["render", "scene.xml", "-m", variant,
-                                                   *map(str, arguments)])  # fmt: skip
+        command = ["render", "scene.xml", "-m", variant, "--keep-integrator"]
+        return CliRunner().invoke(entry.commands, [*command, *map(str, arguments)])
 
     return run
 
@@ -159,7 +159,8 @@ def test_ctrl_c_ends_workers_as_well(folder, variant):
     """A terminal sends Ctrl-C to all processes at once. The finished part of the image is
     written."""
     pytest.importorskip("distributed")
-    command = ["render", "scene.xml", "-m", variant, "--workers", "2", "--spp", str(1 << 24)]
+    command = ["render", "scene.xml", "-m", variant, "--keep-integrator"]
+    command += ["--workers", "2", "--spp", str(1 << 24)]
     process = subprocess.Popen(
         [sys.executable, "-m", "glintbsdf", *command, "--checkpoint", "kept"],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,

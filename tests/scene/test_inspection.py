@@ -142,7 +142,9 @@ def run(capsys, monkeypatch, variant):
     """Run the command line; return what it prints and its errors."""
 
     def run(*arguments: str) -> tuple[str, str]:
-        monkeypatch.setattr(sys, "argv", ["glintbsdf", *arguments, "-m", variant])
+        monkeypatch.setattr(
+            sys, "argv", ["glintbsdf", *arguments, "-m", variant, "--keep-integrator"]
+        )
         with pytest.raises(SystemExit) as exit:
             cli.main()
         assert exit.value.code == 0

@@ -39,7 +39,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str) -> Pat
 @pytest.fixture
 def run(variant):
     def run(*arguments: object):
-        command = ["sequence", "scene.xml", "-m", variant, *map(str, arguments)]
+        command = ["sequence", "scene.xml", "-m", variant, "--keep-integrator"]
+        command += map(str, arguments)
         return CliRunner().invoke(entry.commands, command)
 
     return run

@@ -26,6 +26,7 @@ _INTEGRATORS = ("glint_path",)  # all other plugins are BSDFs
 GROUP = "glintbsdf.plugins"
 
 _added: list[str] = []
+_bsdfs: set[str] = set()
 
 
 class VariantError(RuntimeError):
@@ -61,12 +62,18 @@ def register_plugin(plugin_type: str, made: Callable[[mi.Properties], object]) -
         mi.register_integrator(plugin_type, make)
     else:
         mi.register_bsdf(plugin_type, make)
+        _bsdfs.add(plugin_type)
 
 
 def plugin_types() -> tuple[str, ...]:
     """Return the names of all plugin types, which are the names of the plugin modules."""
     package = importlib.import_module(_PLUGINS)
     return tuple(sorted(module.name for module in pkgutil.iter_modules(package.__path__)))
+
+
+def bsdf_types() -> frozenset[str]:
+    """Return the types of all BSDFs that have been registered, those of other packages included."""
+    return frozenset(_bsdfs)
 
 
 def add_plugins(module: str) -> None:

@@ -25,6 +25,7 @@ from glintbsdf.cli.render_options import (
     check_image,
     image_option,
     render_to_file,
+    replaces_integrator,
 )
 from glintbsdf.cli.render_options import options as render_options
 from glintbsdf.core.interruption import interruptible
@@ -163,6 +164,14 @@ _sensor_option = click.option(
 )
 
 
+_keep_option = click.option(
+    "--keep-integrator",
+    is_flag=True,
+    help='Keep the scene\'s integrator, where "glint_path" would take the place of "path" or '
+    '"direct".',
+)
+
+
 def _image_options(command):
     """Add the options about the scene and its image that all rendering commands share."""
     for option in reversed(
@@ -187,6 +196,7 @@ def _image_options(command):
                 help="Build only the parts of the maps' structures that the scene uses, which a "
                 "survey with few samples finds. The image is the same.",
             ),
+            _keep_option,
         ]
     ):
         command = option(command)
@@ -213,18 +223,23 @@ def render(
     seed: int,
     denoise: bool,
     trim: bool,
+    keep_integrator: bool,
     definitions: dict[str, str],
     **how: Any,
 ) -> None:
     """Render the Mitsuba scene SCENE to an image.
 
-    Glint BSDFs whose "pixel_spread" is 0 get the footprint of the camera's pixels. The same command
-    gives the same image, to the last bit. If the rendering takes more than half a minute,
-    the command first prints an estimate, and what would help. Ctrl-C keeps the finished passes.
+    The integrator "glint_path" takes the place of "path" and "direct" in a scene with glint BSDFs.
+    With others, glint BSDFs whose "pixel_spread" is 0 get the footprint of the camera's pixels. The
+    same command gives the same image, to the last bit. If the rendering takes more than half a
+    minute, the command first prints an estimate, and what would help. Ctrl-C keeps the finished
+    passes.
     """
     options = RenderOptions(**how)
     _activate(variant)
-    request = ImageRequest(scene, definitions, variant, spp, seed, denoise, trim, sensor)
+    request = ImageRequest(
+        scene, definitions, variant, spp, seed, denoise, trim, keep_integrator, sensor
+    )
     with options.cluster(variant) as cluster:
         render_to_file(request, output or scene.with_suffix(".exr"), options, cluster)
 
@@ -278,6 +293,7 @@ def sequence(
     seed: int,
     denoise: bool,
     trim: bool,
+    keep_integrator: bool,
     **how: Any,
 ) -> None:
     """Render frames of the Mitsuba scene SCENE, with different parameters.
@@ -293,7 +309,9 @@ def sequence(
     names = frames.names_of(template, parameters)
     for output in (sheet, video):
         for values in parameters:
-            request = ImageRequest(scene, values, variant, spp, seed, denoise, trim)
+            request = ImageRequest(
+                scene, values, variant, spp, seed, denoise, trim, keep_integrator
+            )
             request.refuse_as_output(output)
     if video:
         frames.require_ffmpeg()
@@ -302,7 +320,9 @@ def sequence(
         folder.mkdir(parents=True, exist_ok=True)
     with options.cluster(variant) as cluster:
         for index, (values, name) in enumerate(zip(parameters, names, strict=True)):
-            request = ImageRequest(scene, values, variant, spp, seed, denoise, trim, sensor)
+            request = ImageRequest(
+                scene, values, variant, spp, seed, denoise, trim, keep_integrator, sensor
+            )
             label = f"Frame {index + 1} of {len(names)}"
             render_to_file(request, name, options.of_frame(index), cluster, label)
     if sheet:
@@ -326,17 +346,24 @@ def sequence(
     help="Samples per pixel, on which footprints depend.  [default: the scene's]",
 )
 @_define_option("Parameter of the scene; may be repeated.")
+@_keep_option
 def inspect(
-    scene: Path, variant: str, sensor: str, spp: int | None, definitions: dict[str, str]
+    scene: Path,
+    variant: str,
+    sensor: str,
+    spp: int | None,
+    definitions: dict[str, str],
+    keep_integrator: bool,
 ) -> None:
     """Report how the Mitsuba scene SCENE uses its glint BSDFs, and what they build.
 
-    For each BSDF: the part of its map and the sizes of footprints that paths of the scene's own
-    sensor and integrator use, at all bounces; the memory of its structures; and their memory with
-    "render --trim".
+    For each BSDF: the part of its map and the sizes of footprints that paths of the scene's sensor
+    and of the integrator of "render" use, at all bounces; the memory of its structures; and their
+    memory with "render --trim".
     """
     _activate(variant)
-    inspected = inspection.load(scene, definitions)
+    glint_path = replaces_integrator(scene, definitions, keep_integrator)
+    inspected = inspection.load(scene, definitions, glint_path)
     with progress("Inspecting") as report:
         findings = inspection.inspect(inspected, spp, sensor, report)
     click.echo("\n\n".join(map(str, findings)) or "The scene has no glint BSDF.")

@@ -202,7 +202,13 @@ class ImageRequest:
     seed: int
     denoise: bool
     trim: bool
+    keep_integrator: bool
     sensor: str = ""
+
+    def with_glint_path(self) -> bool:
+        """Whether to render with ``glint_path`` in place of the scene's integrator, which this
+        tells."""
+        return replaces_integrator(self.scene, self.definitions, self.keep_integrator)
 
     def refuse_as_output(self, path: Path | None) -> None:
         """Refuse to overwrite a file of the scene.
@@ -215,6 +221,18 @@ class ImageRequest:
         documents, files = inputs(self.scene, self.definitions)
         if path.resolve() in {file.resolve() for file in (*documents, *files.values())}:
             raise click.ClickException(f"{path} is a file of the scene: name another with -o")
+
+
+def replaces_integrator(scene: Path, definitions: Mapping[str, str], keep: bool) -> bool:
+    """Whether ``glint_path`` takes the place of the scene's integrator, unless it is to ``keep``
+    its own. A note tells so."""
+    replaced = [] if keep else rendering.integrators_to_replace(scene, definitions)
+    for name in replaced:
+        _tell(
+            f'"glint_path" renders in place of the integrator "{name}", whose noise on glints is '
+            "larger; --keep-integrator keeps it"
+        )
+    return bool(replaced)
 
 
 def render_to_file(
@@ -233,15 +251,16 @@ def render_to_file(
     for output in (path, how.live):
         request.refuse_as_output(output)
     with rendering.replacing(path) as unfinished:
+        glint_path = request.with_glint_path()
         # While the scene loads, plugins show the progress of their structures. With a cluster,
         # nothing is built here: the scene only serves to plan and to develop the image.
         if cluster or request.trim:
-            inspected = inspection.load(request.scene, request.definitions)
+            inspected = inspection.load(request.scene, request.definitions, glint_path)
             loaded = inspected.scene
             if not cluster:
                 trimmed = inspection.Trimmed(inspected, request.spp, request.sensor)
         else:
-            loaded = rendering.load_scene(request.scene, request.definitions)
+            loaded = rendering.load_scene(request.scene, request.definitions, glint_path=glint_path)
         missed = trimmed.missed if trimmed else lambda: False
         if not request.sensor and len(loaded.sensors()) > 1:
             sensors = rendering.listed(loaded.sensors())
@@ -252,7 +271,7 @@ def render_to_file(
             if estimate is not None and estimate.seconds > estimation.LONG:
                 _tell(str(estimate))
             with progress(label if cluster is None else f"{label} by {cluster}") as report:
-                picture, interrupted = _produce(request, renderer, how, cluster, report)
+                picture, interrupted = _produce(request, renderer, how, cluster, report, glint_path)
         rendering.save(picture.bitmap, unfinished)
     if trimmed and not trimmed.sufficed:
         _tell("trimmed structures did not suffice: built in full")
@@ -272,6 +291,7 @@ def _produce(
     how: RenderOptions,
     cluster: Cluster | None,
     report,
+    glint_path: bool,
 ) -> tuple[rendering.Picture, bool]:
     """The image, or the finished part of it if Ctrl-C came; and whether it came."""
     checkpoint = render_all = None
@@ -285,6 +305,7 @@ def _produce(
             request.denoise,
             request.trim,
             request.sensor,
+            glint_path,
         )
         if how.checkpoint:
             checkpoint = Checkpoint(how.checkpoint, job.description())

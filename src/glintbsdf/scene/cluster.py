@@ -198,7 +198,7 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
     if mi.variant() != job.variant:
         mi.set_variant(job.variant)
     with _spare_thread(threads):
-        scene = job.package.load(store, deferred=job.trim)
+        scene = job.package.load(store, deferred=job.trim, glint_path=job.glint_path)
         missed = (
             Trimmed(Inspected.of(scene), job.spp, job.sensor).missed if job.trim else lambda: False
         )

@@ -43,9 +43,13 @@ class Inspected:
         return Inspected(scene, rendering.glint_bsdfs(scene))
 
 
-def load(filename: str | Path, parameters: Mapping[str, str] | None = None) -> Inspected:
-    """Load a scene from XML without building its glint BSDFs."""
-    return Inspected.of(rendering.load_scene(filename, parameters, deferred=True))
+def load(
+    filename: str | Path, parameters: Mapping[str, str] | None = None, glint_path: bool = False
+) -> Inspected:
+    """Load a scene from XML without building its glint BSDFs; see :func:`.load_scene`."""
+    return Inspected.of(
+        rendering.load_scene(filename, parameters, deferred=True, glint_path=glint_path)
+    )
 
 
 def survey(inspected: Inspected, spp: int | None = None, which: str = "") -> list[Domain | None]:

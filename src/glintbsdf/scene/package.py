@@ -212,7 +212,7 @@ class Package:
         """Files that must be sent, as ``store`` does not find them."""
         return [content for content in self.contents if store.find(content) is None]
 
-    def load(self, store: Store, deferred: bool = False) -> mi.Scene:
+    def load(self, store: Store, deferred: bool = False, glint_path: bool = False) -> mi.Scene:
         """Load the scene, see :func:`.load_scene`. No file may be missing.
 
         Raises:
@@ -228,7 +228,7 @@ class Package:
                     raise FileNotFoundError(f"{name} is missing")
                 target.write_bytes(source.read_bytes())
             main = inside(Path(folder), self.documents[0][0])
-            return rendering.load_scene(main, dict(self.definitions), deferred, files)
+            return rendering.load_scene(main, dict(self.definitions), deferred, files, glint_path)
 
 
 def inputs(
@@ -318,6 +318,7 @@ class Job:
         denoise, trim (bool): see :class:`~glintbsdf.scene.rendering.Renderer` and
             :class:`~glintbsdf.scene.inspection.Trimmed`.
         sensor (str): the sensor, see :func:`~glintbsdf.scene.rendering.chosen_sensor`.
+        glint_path (bool): see :func:`~glintbsdf.scene.rendering.load_scene`.
     """
 
     package: Package
@@ -327,6 +328,7 @@ class Job:
     denoise: bool = False
     trim: bool = False
     sensor: str = ""
+    glint_path: bool = False
 
     def description(self) -> dict[str, object]:
         """Everything that determines the image, for checkpoints, as values for JSON."""

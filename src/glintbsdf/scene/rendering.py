@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.bridge.filter_sampling import SharedFilter
+from glintbsdf.bridge.registration import bsdf_types
 from glintbsdf.core.garbage import collect_former_scenes
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.scene import passes
@@ -39,6 +40,7 @@ def load_scene(
     parameters: Mapping[str, str] | None = None,
     deferred: bool = False,
     files: Mapping[str, str] | None = None,
+    glint_path: bool = False,
 ) -> mi.Scene:
     """Load a scene from XML.
 
@@ -51,12 +53,14 @@ def load_scene(
         deferred: whether glint BSDFs build nothing yet. :func:`glint_bsdfs` finds them, and their
             ``build`` must be called for the queries that the scene needs.
         files: paths of files, by the names that the scene has for them.
+        glint_path: whether the integrator ``glint_path`` takes the place of those that
+            :func:`replaceable` finds.
     """
     collect_former_scenes()
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
     parameters = dict(parameters or {})
-    if not deferred and not files:
+    if not deferred and not files and not glint_path:
         # The stubs cannot know the names of a scene's parameters.
         return mi.load_file(str(filename), **parameters)  # type: ignore[arg-type]
     config = mi.parser.ParserConfig(mi.variant() or "")
@@ -66,6 +70,8 @@ def load_scene(
             if files and value in files:
                 node.props[key] = files[value]
         mi.parser.transform_all(config, state)
+        for node in replaceable(state) if glint_path else ():
+            replace_integrator(node)
         for node in state.nodes:
             if deferred and node.props.plugin_name() in DEFERRABLE:
                 node.props["deferred"] = True
@@ -82,6 +88,45 @@ def strings(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode,
             value = node.props[key]
             if isinstance(value, str):
                 yield node, key, value
+
+
+#: Mitsuba's integrators whose place ``glint_path`` can take.
+REPLACEABLE = ("path", "direct")
+
+#: Parameters of these integrators that ``glint_path`` does not have: numbers of samples.
+_NUMBERS_OF_SAMPLES = ("shading_samples", "emitter_samples", "bsdf_samples")
+
+
+def replaceable(state: mi.parser.ParserState) -> list[mi.parser.SceneNode]:
+    """The integrators of a parsed scene that :func:`replace_integrator` can replace; none in a
+    scene without glint BSDFs."""
+    types = [node.props.plugin_name() for node in state.nodes]
+    if not bsdf_types() & set(types):
+        return []
+    return [node for node, kind in zip(state.nodes, types, strict=True) if kind in REPLACEABLE]
+
+
+def replace_integrator(node: mi.parser.SceneNode) -> None:
+    """Make a ``path`` or a ``direct`` a ``glint_path`` that estimates the same image."""
+    if node.props.plugin_name() == "direct":
+        for name in _NUMBERS_OF_SAMPLES:
+            if name in node.props:
+                del node.props[name]
+        node.props["max_depth"] = 2
+    node.props.set_plugin_name("glint_path")
+
+
+def integrators_to_replace(
+    filename: str | Path, parameters: Mapping[str, str] | None = None
+) -> list[str]:
+    """Types of the integrators of a scene's XML that ``glint_path`` can replace.
+
+    Raises:
+        RuntimeError: the XML cannot be read.
+    """
+    config = mi.parser.ParserConfig(mi.variant() or "")
+    state = mi.parser.parse_file(config, str(filename), **dict(parameters or {}))
+    return [node.props.plugin_name() for node in replaceable(state)]
 
 
 #: Plugins that do not build their structures in a scene that is loaded ``deferred``.
