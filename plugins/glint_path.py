@@ -76,8 +76,8 @@ consistent.
 
 This needs an :monosp:`hdrfilm`, and a filter with a positive variance, which :monosp:`catmullrom`
 and :monosp:`lanczos` do not have. Otherwise, and inside other integrators such as :monosp:`aov`,
-footprints are scaled by :math:`1/\sqrt{\mathrm{spp}}`. They are scaled in the same way for
-derivatives, which Mitsuba renders itself.
+footprints are scaled by :math:`1/\sqrt{\mathrm{spp}}`. Derivatives of an image share the filter as
+the image does.
 
 **Small lights are sampled at every hit**, as the noise of a random choice would be large on glints.
 Environments are not small. One of the remaining emitters is chosen in proportion to its

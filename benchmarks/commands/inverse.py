@@ -64,9 +64,10 @@ def derivatives(run: Run) -> None:
     difference. Expected: they agree within 2 % or the noise, and no step compiles a kernel.
     """
     with run.table("derivatives") as table:
-        for method, (bsdf, keys, spp) in examples().items():
-            for integrator in INTEGRATORS[:1] if run.quick else INTEGRATORS:
-                work = partial(render_derivatives, bsdf, keys, integrator, spp)
+        for method, (bsdf, keys, settings) in examples().items():
+            for integrator in ["prb"] if run.quick else INTEGRATORS:
+                arguments = {**settings, **INTEGRATORS[integrator]}
+                work = partial(render_derivatives, bsdf, keys, integrator, **arguments)
                 table.measure(
                     {"method": method, "integrator": integrator},
                     lambda work=work: [derivative.row() for derivative in work()],
@@ -88,7 +89,7 @@ def cost(run: Run) -> None:
 
 def ratio(bsdf: dict, key: str, integrator: str, repetitions: int) -> dict:
     """A row of :func:`cost`."""
-    description = plate(bsdf, integrator, 64)
+    description = plate(bsdf, integrator, size=64)
     if integrator == "direct":
         description["integrator"] |= {"emitter_samples": 1, "bsdf_samples": 0}
     scene = mi.load_dict(description)

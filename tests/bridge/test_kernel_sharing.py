@@ -39,7 +39,8 @@ def a_map(size: int = 64) -> np.ndarray:
 def plate(plugin: str, options: dict, size: int = 64, wrapped: bool = False) -> mi.Scene:
     camera = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 8, "height": 8}
-    bsdf = {"type": plugin, "data": mi.TensorXf(a_map(size)), "pixel_spread": 0.01, **options}
+    data = {} if "seed" in options else {"data": mi.TensorXf(a_map(size))}
+    bsdf = {"type": plugin, "pixel_spread": 0.01, **data, **options}
     if wrapped:
         bsdf = {"type": "twosided", "bsdf": bsdf}
     return mi.load_dict(
@@ -69,6 +70,26 @@ def test_another_map_compiles_nothing(variant, monkeypatch, plugin, options):
 
     def show():
         np.array(mi.render(plate(plugin, options), spp=1))
+
+    counts = [compiled(show) for _ in range(3)]
+    assert counts[2] == 0, counts
+
+
+@pytest.mark.parametrize(
+    ("plugin", "options"),
+    [
+        ("glint_grid", {"density": 5.0}),
+        ("glint_particles", {"density": 5.0}),
+        ("glint_elements", {"flake_density": 400.0}),
+    ],
+    ids=str,
+)
+def test_another_pattern_compiles_nothing(variant, monkeypatch, plugin, options):
+    monkeypatch.setenv("GLINTBSDF_CACHE", "off")
+    seeds = np.random.default_rng().integers(1 << 30, size=3).tolist()
+
+    def show():
+        np.array(mi.render(plate(plugin, {**options, "seed": seeds.pop()}), spp=1))
 
     counts = [compiled(show) for _ in range(3)]
     assert counts[2] == 0, counts

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from glintbsdf import Footprint
-from glintbsdf.check.derivatives import check_render_derivatives, examples
+from glintbsdf.check.derivatives import INTEGRATORS, check_render_derivatives, examples
 from glintbsdf.check.suite import View
 from glintbsdf.pndf import Flakes, Grid
 
 NAMES = (
-    *("elements", "manifold", "manifold, map", "tables", "lean"),
-    *("diffuse", "mip", "flakes", "grid", "particles"),
+    *("elements", "elements, lamp", "manifold", "manifold, map", "tables"),
+    *("lean", "diffuse", "mip", "flakes", "grid", "particles"),
 )
 
 
@@ -32,26 +32,32 @@ def two_sided(nested: dict) -> dict:
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_an_image(variant, name):
     assert set(examples()) == set(NAMES)
-    plate, keys, spp = examples()[name]
-    check_render_derivatives(plate, keys, "prb", spp)
+    plate, keys, settings = examples()[name]
+    # What makes noise: the lamp's edge where a BSDF's samples cross it, and random patterns.
+    noisy = {"elements, lamp": 0.15, "manifold, map": 0.3, "grid": 0.15}
+    resolution = noisy.get(name, 0.05)
+    check_render_derivatives(plate, keys, "prb", resolution, **settings)
 
 
 # Masking is left out where it is not what differs.
 @pytest.mark.parametrize("integrator", ["prb_basic", "direct"])
 def test_derivative_in_other_integrators(variant, integrator):
-    check_render_derivatives(two_sided(bsdf("elements", masking="none")), ["sigma_r"], integrator)
+    plate = two_sided(bsdf("elements", masking="none"))
+    check_render_derivatives(plate, ["sigma_r"], integrator, 0.15, **INTEGRATORS[integrator])
 
 
 @pytest.mark.parametrize("integrator", ["path", "glint_path"])
 def test_derivatives_in_symbolic_integrators(variant, integrator):
     plate = two_sided(bsdf("elements", masking="none"))
-    check_render_derivatives(plate, ["sigma_r", "data"], integrator)
+    check_render_derivatives(
+        plate, ["sigma_r", "data"], integrator, lamp="sphere", spp=64, resolution=0.3
+    )
 
 
 @pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])
 def test_derivative_in_forward_mode(variant, integrator):
     plate = two_sided(bsdf("elements", masking="none"))
-    check_render_derivatives(plate, ["sigma_r"], integrator, spp=256, seeds=3, modes=("forward",))
+    check_render_derivatives(plate, ["sigma_r"], integrator, modes=("forward",))
 
 
 def test_what_has_no_derivative_says_so(variant):

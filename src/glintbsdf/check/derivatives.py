@@ -60,16 +60,24 @@ class Derivative:
         )
 
 
-#: Integrators whose derivatives are right.
-INTEGRATORS = ("prb", "prb_basic", "direct", "path", "glint_path")
+#: Integrators whose derivatives are right, and the arguments of :func:`render_derivatives` that it
+#: takes to see them: ``prb_basic`` finds lights by samples of the BSDF only.
+INTEGRATORS: dict[str, dict] = {
+    "prb": {},
+    "prb_basic": {"lamp": "sphere", "spp": 256, "seeds": 8},
+    "direct": {},
+    "path": {},
+    "glint_path": {},
+}
 
 
-def examples() -> dict[str, tuple[dict, tuple[str, ...], int]]:
+def examples() -> dict[str, tuple[dict, tuple[str, ...], dict]]:
     """Every plugin with all of its parameters that have a derivative image by image.
 
-    By name: a description inside of an adapter for its back; the parameters; and the samples per
-    pixel that it takes to see their derivatives. The densities of flakes and of microdetails are
-    not among them: their derivatives are right on average over patterns alone.
+    By name: a description inside of an adapter for its back; the parameters; and further arguments
+    of :func:`render_derivatives` that it takes to see their derivatives. The densities of flakes
+    and of microdetails are not among them: their derivatives are right on average over patterns
+    alone. Under a point light, differences of the exact P-NDF of a map jump as its triangles move.
     """
     normals = maps.isotropic(32, alpha=0.2, correlation_length=3, seed=5).normals
     data = {"data": mi.TensorXf(normals)}
@@ -87,26 +95,42 @@ def examples() -> dict[str, tuple[dict, tuple[str, ...], int]]:
     flakes = {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08}
     grid = {"type": "glint_grid", "alpha": 0.2, "density": 6.0, "int_ior": 1.5}
     particles = {"type": "glint_particles", "alpha": 0.2, "micro_alpha": 0.05, "density": 4.0}
-    table = {
-        "elements": (elements, ("sigma_r", *sizes, "data"), 64),
-        "manifold": (manifold, sizes, 256),
-        "manifold, map": (manifold, ("data",), 256),
-        "tables": (tables, ("footprint_sigma",), 256),
-        "lean": (lean, ("alpha", "pixel_spread", "data", *of_metal), 64),
-        "diffuse": (diffuse, ("data", "reflectance.value"), 16),
-        "mip": (mip, ("sigma_r",), 16),
-        "flakes": (flakes, ("sigma_r", "flake_alpha"), 64),
-        "particles": (particles, ("alpha_u", "alpha_v", "micro_alpha"), 256),
-        "grid": (grid, ("alpha_u", "alpha_v", "intensity", "eta"), 64),
+    lamp = {"lamp": "sphere", "spp": 64}
+    table: dict[str, tuple[dict, tuple[str, ...], dict]] = {
+        "elements": (elements, ("sigma_r", *sizes, "data"), {}),
+        "elements, lamp": (elements, ("sigma_r", "data"), lamp),
+        "manifold": (manifold, sizes, {}),
+        "manifold, map": (manifold, ("data",), {**lamp, "spp": 256}),
+        "tables": (tables, ("footprint_sigma",), {}),
+        "lean": (lean, ("alpha", "pixel_spread", "data", *of_metal), {}),
+        "diffuse": (diffuse, ("data", "reflectance.value"), {}),
+        "mip": (mip, ("sigma_r",), {}),
+        "flakes": (flakes, ("sigma_r", "flake_alpha"), {}),
+        "particles": (particles, ("alpha_u", "alpha_v", "micro_alpha"), {}),
+        "grid": (grid, ("alpha_u", "alpha_v", "intensity", "eta"), {"patterns": True, "seeds": 16}),
     }
     return {
-        name: ({"type": "twosided", "nested": {"pixel_spread": 0.02, **bsdf}}, keys, spp)
-        for name, (bsdf, keys, spp) in table.items()
+        name: ({"type": "twosided", "nested": {"pixel_spread": 0.02, **bsdf}}, keys, settings)
+        for name, (bsdf, keys, settings) in table.items()
     }
 
 
-def plate(bsdf: dict, integrator: str = "prb", size: int = 16) -> dict:
-    """A plate under a spherical lamp, for ``mi.load_dict``; the picture has ``size``² pixels."""
+#: Lights over the plate. Only under the first do samples keep their places as parameters change, so
+#: that differences of few samples tell the derivative. A BSDF's own samples find the second only.
+LAMPS = {
+    "point": {"type": "point", "position": [0.6, 0.3, 4], "intensity": 8.0},
+    "sphere": {
+        "type": "sphere",
+        "center": [0.6, 0.3, 4],
+        "radius": 0.5,
+        "emitter": {"type": "area", "radiance": 10.0},
+    },
+}
+
+
+def plate(bsdf: dict, integrator: str = "prb", lamp: str = "point", size: int = 16) -> dict:
+    """A plate under one of the :data:`LAMPS`, for ``mi.load_dict``; the picture has ``size``²
+    pixels."""
     depth = {} if integrator == "direct" else {"max_depth": 2}
     return {
         "type": "scene",
@@ -118,12 +142,7 @@ def plate(bsdf: dict, integrator: str = "prb", size: int = 16) -> dict:
             "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
         },
         "plate": {"type": "rectangle", "bsdf": bsdf},
-        "lamp": {
-            "type": "sphere",
-            "center": [0.6, 0.3, 4],
-            "radius": 0.5,
-            "emitter": {"type": "area", "radiance": 10.0},
-        },
+        "lamp": LAMPS[lamp],
     }
 
 
@@ -165,75 +184,110 @@ class Grown:
         self.params.update()
 
 
+class Picture:
+    """A picture of a plate, summed to one number.
+
+    It is weighed by itself, so that contrast counts as well as brightness.
+
+    Args:
+        description: of the scene, see :func:`plate`.
+        keys: the parameters to differentiate by, as ``mi.traverse`` names them in the BSDF.
+        spp: samples per pixel.
+    """
+
+    def __init__(self, description: dict, keys: Sequence[str], spp: int) -> None:
+        self.scene = mi.load_dict(description)
+        self.grown, self.spp = Grown(self.scene, keys), spp
+        self.grown.set(1, False)
+        weights = mi.render(self.scene, spp=4 * spp, seed=0)
+        self.weights = dr.detach(weights / dr.mean(weights, axis=None))
+
+    def sum(self, seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
+        """The number; differentiable by ``params`` if they are given."""
+        # Derivatives take the samples of the differences; the image beside them is not looked at.
+        seeds = {"seed": seed} if params is None else {"seed": 0, "seed_grad": seed}
+        image = mi.render(self.scene, params, spp=self.spp, **seeds)
+        return dr.mean(image * self.weights, axis=None)
+
+    def difference(self, key: str, seed: int) -> float:
+        """Central difference for a relative change of a parameter."""
+        values = []
+        for factor in (1 + STEP, 1 - STEP):
+            self.grown.set(1, False, **{key: factor})
+            values.append(float(self.sum(seed).array[0]))
+        return (values[0] - values[1]) / (2 * STEP)
+
+    def reverse(self, seed: int) -> list[float]:
+        """The derivatives with respect to all parameters, per relative change."""
+        self.grown.set(1 + 1e-4 * seed, True)  # other values, as steps of an optimisation have
+        dr.backward(self.sum(seed, self.grown.params))
+        params, names = self.grown.params, self.grown.names
+        gradients = {key: dr.grad(params[name]) for key, name in names.items()}
+        return [
+            float((np.array(gradients[key]).reshape(start.shape) * start).sum())
+            for key, start in self.grown.start.items()
+        ]
+
+    def forward(self, seed: int) -> list[float]:
+        """The sum of :meth:`reverse`, in forward mode."""
+        self.grown.set(1 + 1e-4 * seed, True)
+        params = self.grown.params
+        # What an update derives from a parameter lies outside of the rendering: it takes its
+        # derivative first, as Mitsuba asks it of everybody who goes forward.
+        for key, name in self.grown.names.items():
+            dr.set_grad(params[name], self.grown.values(key, 1))
+            dr.enqueue(dr.ADMode.Forward, params[name])
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        return [float(dr.forward_to(self.sum(seed, params)).array[0])]
+
+
 def render_derivatives(
     bsdf: dict,
     keys: Sequence[str],
     integrator: str = "prb",
-    spp: int = 64,
-    seeds: int = 5,
+    spp: int = 16,
+    seeds: int = 3,
     modes: Sequence[str] = ("reverse",),
+    lamp: str = "point",
+    patterns: bool = False,
 ) -> list[Derivative]:
-    """Derivatives of an image with respect to parameters, and differences of images.
+    """Derivatives of a :class:`Picture` with respect to parameters, and differences of pictures.
 
-    The image is weighed by itself, so that contrast counts as well as brightness. All values of a
-    parameter grow by the same factor. In reverse mode all parameters are differentiated at once. In
-    forward mode they are asked for together: the result is their sum, under the keys' names.
+    All values of a parameter grow by the same factor. In reverse mode all parameters are
+    differentiated at once. In forward mode they are asked for together: the result is their sum,
+    under the keys' names.
 
     Args:
         bsdf: description of the BSDF, with an adapter for its back.
         keys: the parameters, as ``mi.traverse`` names them in the BSDF.
+        integrator: its plugin.
         spp: samples per pixel of 16².
         seeds: how many seeds, which tell the noise.
+        modes: ``reverse``, ``forward`` or both.
+        lamp: which of the :data:`LAMPS` is over the plate.
+        patterns: whether the ``seed`` of the BSDF changes as well: its derivatives are right on
+            average over random patterns only.
     """
-    scene = mi.load_dict(plate(bsdf, integrator))
-    grown = Grown(scene, keys)
-    grown.set(1, False)
-    weights = mi.render(scene, spp=4 * spp, seed=seeds)
-    weights = dr.detach(weights / dr.mean(weights, axis=None))
 
-    def measure(seed: int, params: mi.SceneParameters | None = None) -> mi.Float:
-        return dr.mean(mi.render(scene, params, spp=spp, seed=seed) * weights, axis=None)
+    def picture(seed: int) -> Picture:
+        nested = {**bsdf["nested"], "seed": seed} if patterns else bsdf["nested"]
+        return Picture(plate({**bsdf, "nested": nested}, integrator, lamp), keys, spp)
 
-    def difference(key: str, seed: int) -> float:
-        values = []
-        for factor in (1 + STEP, 1 - STEP):
-            grown.set(1, False, **{key: factor})
-            values.append(float(measure(seed).array[0]))
-        return (values[0] - values[1]) / (2 * STEP)
-
-    def reverse(seed: int) -> list[float]:
-        grown.set(1 + 1e-4 * seed, True)  # other values, as steps of an optimisation have
-        dr.backward(measure(seed, grown.params))
-        gradients = {key: dr.grad(grown.params[name]) for key, name in grown.names.items()}
-        return [
-            float((np.array(gradients[key]).reshape(start.shape) * start).sum())
-            for key, start in grown.start.items()
-        ]
-
-    def forward(seed: int) -> float:
-        grown.set(1 + 1e-4 * seed, True)
-        # What an update derives from a parameter lies outside of the rendering: it takes its
-        # derivative first, as Mitsuba asks it of everybody who goes forward.
-        for key, name in grown.names.items():
-            dr.set_grad(grown.params[name], grown.values(key, 1))
-            dr.enqueue(dr.ADMode.Forward, grown.params[name])
-        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
-        return float(dr.forward_to(measure(seed, grown.params)).array[0])
-
+    fixed = None if patterns else picture(0)
     differences: list[list[float]] = []
     automatic: dict[str, list[list[float]]] = {mode: [] for mode in modes}
     compiled = 0
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for seed in range(seeds):
+        for seed in range(1, seeds + 1):
             dr.kernel_history_clear()
-            differences.append([difference(key, seed) for key in keys])
-            if "reverse" in modes:
-                automatic["reverse"].append(reverse(seed))
-            if "forward" in modes:
-                automatic["forward"].append([forward(seed)])
-            if seed > 0:
+            one = fixed or picture(seed)
+            differences.append([one.difference(key, seed) for key in keys])
+            for mode, results in automatic.items():
+                results.append(one.reverse(seed) if mode == "reverse" else one.forward(seed))
+            if seed > 1:
                 history = dr.kernel_history([dr.KernelType.JIT])
                 compiled += sum(not kernel["cache_hit"] for kernel in history)
+            del one  # before the next: while two scenes live, Mitsuba numbers their parts otherwise
 
     def compared(key: str, mode: str, ours: np.ndarray, theirs: np.ndarray) -> Derivative:
         noise = 3 * (ours - theirs).std(ddof=1) / np.sqrt(seeds)
@@ -252,20 +306,14 @@ def render_derivatives(
 
 
 def check_render_derivatives(
-    bsdf: dict,
-    keys: Sequence[str],
-    integrator: str = "prb",
-    spp: int = 64,
-    seeds: int = 5,
-    modes: Sequence[str] = ("reverse",),
-    resolution: float = 0.5,
+    bsdf: dict, keys: Sequence[str], integrator: str = "prb", resolution: float = 0.1, **settings
 ) -> None:
     """Derivatives of an image are right, and their steps compile no kernel anew.
 
-    See :func:`render_derivatives`. A check so noisy that it would let ``resolution`` times the
-    derivative pass fails as well.
+    See :func:`render_derivatives`, which takes the ``settings``. A check so noisy that it would let
+    ``resolution`` times the derivative pass fails as well.
     """
-    for derivative in render_derivatives(bsdf, keys, integrator, spp, seeds, modes):
+    for derivative in render_derivatives(bsdf, keys, integrator, **settings):
         assert derivative.right, f"{integrator}: {derivative}"
         clear = derivative.noise <= resolution * abs(derivative.difference)
         assert clear, f"{integrator}, too noisy: {derivative}"

@@ -441,7 +441,8 @@ class Grid(PNDF):
         for name, value in values.items():
             setattr(self, name, mi.Float(value))
         self.colors, self.owner = colors, owner
-        self.seed = pcg3d(mi.UInt32(seed), 0, 0)[0]
+        self.seed = pcg3d(dr.opaque(mi.UInt32, seed), 0, 0)[0]
+        dr.make_opaque(self.seed)
         self.derive()
         self.mean = SmoothBeckmann(lambda: self.alpha, self.roughness_keys, owner)
 
