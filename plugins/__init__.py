@@ -8,7 +8,8 @@ described here:
  * - filename
    - |string|
    - Image file of the normal or height map: OpenEXR, PNG, TIFF, or any other format that Mitsuba
-     reads. A relative name is relative to the scene's folder.
+     reads. A relative name is relative to the scene's folder. The file of the examples on these
+     pages comes from ``glintbsdf example scratched``.
 
  * - bitmap
    - :monosp:`mitsuba.Bitmap`

@@ -49,15 +49,21 @@ coordinates.
         :name: lst-glint_diffuse
 
         <bsdf type="glint_diffuse">
-            <string name="filename" value="plaster.exr"/>
+            <string name="filename" value="scratched.exr"/>
             <rgb name="reflectance" value="0.8, 0.7, 0.6"/>
         </bsdf>
 
     .. code-tab:: python
 
-        'type': 'glint_diffuse',
-        'filename': 'plaster.exr',
-        'reflectance': {'type': 'rgb', 'value': [0.8, 0.7, 0.6]}
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_diffuse',
+            'filename': 'scratched.exr',
+            'reflectance': {'type': 'rgb', 'value': [0.8, 0.7, 0.6]},
+        })
 
 Reference: Liwen Wu, Fujun Luan, Miloš Hašan and Ravi Ramamoorthi, "Position-Normal Manifold for
 Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), section 4.3 and, for

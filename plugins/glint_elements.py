@@ -97,7 +97,7 @@ coordinates.
         :name: lst-glint_elements
 
         <bsdf type="glint_elements">
-            <string name="filename" value="scratches.exr"/>
+            <string name="filename" value="scratched.exr"/>
             <transform name="to_uv">
                 <scale x="4" y="4"/>
             </transform>
@@ -106,18 +106,24 @@ coordinates.
         </bsdf>
 
         <bsdf type="glint_elements">
-            <float name="flake_density" value="1e5"/>
+            <float name="flake_density" value="3e4"/>
             <float name="flake_alpha" value="0.15"/>
             <string name="material" value="Al"/>
         </bsdf>
 
     .. code-tab:: python
 
-        'type': 'glint_elements',
-        'filename': 'scratches.exr',
-        'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
-        'sigma_r': 0.005,
-        'material': 'Al'
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_elements',
+            'filename': 'scratched.exr',
+            'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
+            'sigma_r': 0.005,
+            'material': 'Al',
+        })
 
 Reference: Ling-Qi Yan, Miloš Hašan, Steve Marschner and Ravi Ramamoorthi, "Position-Normal
 Distributions for Efficient Rendering of Specular Microstructure" (:cite:`Yan2016`),

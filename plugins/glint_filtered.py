@@ -83,7 +83,7 @@ coordinates.
         :name: lst-glint_filtered
 
         <bsdf type="glint_filtered">
-            <string name="filename" value="scratches.exr"/>
+            <string name="filename" value="scratched.exr"/>
             <string name="method" value="leadr"/>
             <float name="alpha" value="0.02"/>
             <string name="material" value="Al"/>
@@ -91,11 +91,17 @@ coordinates.
 
     .. code-tab:: python
 
-        'type': 'glint_filtered',
-        'filename': 'scratches.exr',
-        'method': 'leadr',
-        'alpha': 0.02,
-        'material': 'Al'
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_filtered',
+            'filename': 'scratched.exr',
+            'method': 'leadr',
+            'alpha': 0.02,
+            'material': 'Al',
+        })
 
 Reference: Tomas Akenine-Möller et al., "Real-Time Rendering", 4th edition, section 9.13.1
 (:cite:`RTR4`).

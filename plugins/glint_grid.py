@@ -127,12 +127,18 @@ coordinates.
 
     .. code-tab:: python
 
-        'type': 'glint_grid',
-        'alpha': 0.4,
-        'detail_alpha': 0.03,
-        'density': 6.5,
-        'colors': 'wheel',
-        'material': 'Al'
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_grid',
+            'alpha': 0.4,
+            'detail_alpha': 0.03,
+            'density': 6.5,
+            'colors': 'wheel',
+            'material': 'Al',
+        })
 
 Reference: Tobias Zirr and Anton S. Kaplanyan, "Real-time Rendering of Procedural Multiscale
 Materials" (:cite:`Zirr16Multiscale`).

@@ -110,7 +110,7 @@ coordinates.
         :name: lst-glint_manifold
 
         <bsdf type="glint_manifold">
-            <string name="filename" value="scratches.exr"/>
+            <string name="filename" value="scratched.exr"/>
             <transform name="to_uv">
                 <scale x="4" y="4"/>
             </transform>
@@ -119,10 +119,16 @@ coordinates.
 
     .. code-tab:: python
 
-        'type': 'glint_manifold',
-        'filename': 'scratches.exr',
-        'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
-        'material': 'Al'
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_manifold',
+            'filename': 'scratched.exr',
+            'to_uv': mi.ScalarTransform4f().scale([4, 4, 1]),
+            'material': 'Al',
+        })
 
 Reference: Liwen Wu, Fujun Luan, Miloš Hašan and Ravi Ramamoorthi, "Position-Normal Manifold for
 Efficient Glint Rendering on High-Resolution Normal Maps" (:cite:`Wu24Glint`), section 4.

@@ -155,17 +155,23 @@ coordinates.
         :name: lst-glint_mip
 
         <bsdf type="glint_mip">
-            <string name="filename" value="scratches.exr"/>
-            <integer name="output_size" value="4096"/>
+            <string name="filename" value="scratched.exr"/>
+            <integer name="output_size" value="2048"/>
             <string name="material" value="Al"/>
         </bsdf>
 
     .. code-tab:: python
 
-        'type': 'glint_mip',
-        'filename': 'scratches.exr',
-        'output_size': 4096,
-        'material': 'Al'
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_mip',
+            'filename': 'scratched.exr',
+            'output_size': 2048,
+            'material': 'Al',
+        })
 
 Reference: Haowen Tan, Junqiu Zhu, Yanning Xu, Xiangxu Meng, Lu Wang and Ling-Qi Yan, "Real-Time
 Microstructure Rendering with MIP-mapped Normal Map Samples" (:cite:`Tan2022`), section 5.

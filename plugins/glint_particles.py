@@ -132,13 +132,19 @@ inside ``normalmap``, ``bumpmap`` and ``mask`` as well.
 
     .. code-tab:: python
 
-        'type': 'glint_particles',
-        'alpha': 0.4,
-        'density': 6.0,
-        'micro_alpha': 0.02,
-        'color': {'type': 'rgb', 'value': [0.9, 0.3, 0.4]},
-        'hue_variation': 0.05,
-        'value_variation': 0.5
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        bsdf = mi.load_dict({
+            'type': 'glint_particles',
+            'alpha': 0.4,
+            'density': 6.0,
+            'micro_alpha': 0.02,
+            'color': {'type': 'rgb', 'value': [0.9, 0.3, 0.4]},
+            'hue_variation': 0.05,
+            'value_variation': 0.5,
+        })
 
 Reference: Pauli Kemppinen, Loïs Paulin, Théo Thonat, Jean-Marc Thiery, Jaakko Lehtinen and Tamy
 Boubekeur, "Evaluating and Sampling Glinty NDFs in Constant Time" (:cite:`Kemppinen2025Glints`).

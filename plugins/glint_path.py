@@ -126,9 +126,16 @@ smooth lobe differs from the glints. For BSDFs of your own, see ``glintbsdf.brid
 
     .. code-tab:: python
 
-        'type': 'glint_path',
-        'max_depth': 8,
-        'separate': True
+        import glintbsdf
+        import mitsuba as mi
+
+        mi.set_variant('llvm_ad_rgb')
+        integrator = mi.load_dict({
+            'type': 'glint_path',
+            'max_depth': 8,
+            'separate': True,
+        })
+
 """
 
 from __future__ import annotations
