@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
+
+# Most of the time of the tests is LLVM's. "optimised" tests the kernels that users get.
+os.environ.setdefault("GLINTBSDF_KERNELS", "quick")
 
 import glintbsdf  # noqa: F401  (first: it names the LLVM library that Dr.Jit is to load)
 

@@ -151,3 +151,28 @@ def test_choice_without_a_usable_library_is_silent(monkeypatch):
     monkeypatch.setattr(llvm, "find", list)
     llvm.choose()
     assert llvm.VARIABLE not in os.environ
+
+
+def test_quick_kernels_compute_the_same_and_are_kept_apart(monkeypatch, tmp_path, usable):
+    if usable.version[0] < llvm.QUICK_MINIMUM_VERSION:
+        pytest.skip("this LLVM does not know how to compile quickly")
+    script = (
+        "import glintbsdf, drjit as dr, mitsuba as mi\n"
+        "mi.set_variant('llvm_ad_rgb')\n"
+        "x = dr.arange(mi.Float, 7)\n"
+        "print(dr.exp(dr.sin(x)) * dr.erfinv(x / 9), dr.fma(x, x, 0.1))"
+    )
+    outputs = {}
+    for kernels in ("optimised", "quick"):
+        monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / f"of_{kernels}"))
+        monkeypatch.setenv(llvm.QUICK_VARIABLE, kernels)
+        outputs[kernels] = python(script).stdout
+    assert outputs["quick"] == outputs["optimised"] != ""
+    folders = {path.parent for path in tmp_path.glob("**/*.bin")}
+    assert folders == {tmp_path / "of_optimised", tmp_path / "of_quick" / "quick"}
+
+
+def test_an_unknown_kind_of_kernels_is_refused(monkeypatch):
+    monkeypatch.setenv(llvm.QUICK_VARIABLE, "fast")
+    with pytest.raises(llvm.LLVMError, match='"optimised" or "quick" \\(got "fast"\\)'):
+        llvm.choose()

@@ -7,10 +7,16 @@ newest library of at least :data:`MINIMUM_VERSION` and names it before that happ
 
 Versions come from file names, or from a separate process: two LLVMs in one process are
 best avoided.
+
+LLVM takes longer to compile a large kernel than a short test, a preview or the first step of an
+optimisation takes to run it. With the environment variable ``GLINTBSDF_KERNELS`` set to ``quick``,
+LLVM leaves out the passes that only make kernels faster. The numbers that kernels compute stay the
+same.
 """
 
 from __future__ import annotations
 
+import ctypes
 import glob
 import os
 import platform
@@ -27,6 +33,17 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 MINIMUM_VERSION = 16
 """Oldest major version with which Dr.Jit's kernels compile."""
+
+
+QUICK_VARIABLE = "GLINTBSDF_KERNELS"
+"""Name of the environment variable that asks for kernels that compile quickly."""
+
+QUICK_OPTIONS = ("-opt-bisect-limit=0", "-opt-bisect-verbose=0", "-regalloc=fast")
+"""Options of LLVM that leave out optional passes, say nothing of it, and allocate registers in one
+pass."""
+
+QUICK_MINIMUM_VERSION = 18
+"""Oldest major version that is given these options. LLVM ends the process at an unknown one."""
 
 
 class LLVMError(RuntimeError):
@@ -56,12 +73,47 @@ def choose() -> None:
     It is called when the package is imported. It does nothing if there is no usable library, as
     a program that runs on the GPU needs none, or if Dr.Jit was imported before and has made its
     choice. Then :func:`require_usable` raises an error where LLVM is needed.
+
+    Raises:
+        LLVMError: the environment variable ``GLINTBSDF_KERNELS`` is neither ``optimised`` nor
+            ``quick``.
     """
-    if VARIABLE in os.environ or "drjit" in sys.modules:
+    kernels = os.environ.get(QUICK_VARIABLE, "optimised")
+    if kernels not in ("optimised", "quick"):
+        raise LLVMError(f'{QUICK_VARIABLE} must be "optimised" or "quick" (got "{kernels}")')
+    if "drjit" in sys.modules:
         return
-    library = next((library for library in find() if library.usable), None)
-    if library is not None:
+    if VARIABLE not in os.environ:
+        library = next((library for library in find() if library.usable), None)
+        if library is None:
+            return
         os.environ[VARIABLE] = library.path
+    if kernels == "quick":
+        compile_quickly(os.environ[VARIABLE])
+
+
+def compile_quickly(path: str) -> None:
+    """Have the LLVM library at ``path``, which Dr.Jit is about to load, compile quickly.
+
+    Nothing changes if the library is too old to know how. Dr.Jit keeps compiled kernels on disk,
+    and does not see how they were compiled. So these go to a folder ``quick`` of their own.
+    """
+    version = _version(path)
+    if version is None or version[0] < QUICK_MINIMUM_VERSION:
+        return
+    folder = os.environ.get("DRJIT_CACHE_DIR", os.path.join(os.path.expanduser("~"), ".drjit"))
+    if os.path.basename(folder) != "quick":  # that of the process which has started this one
+        folder = os.path.join(folder, "quick")
+    try:
+        library = ctypes.CDLL(path)
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return
+    os.environ["DRJIT_CACHE_DIR"] = folder
+    arguments = [option.encode() for option in ("glintbsdf", *QUICK_OPTIONS)]
+    library.LLVMParseCommandLineOptions(
+        len(arguments), (ctypes.c_char_p * len(arguments))(*arguments), None
+    )
 
 
 def require_usable() -> None:
