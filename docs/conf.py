@@ -14,6 +14,7 @@ author = "the glintbsdf developers"
 release = glintbsdf.__version__
 
 extensions = [
+    "pictures",
     "plugin_pages",
     "myst_nb",
     "sphinx.ext.autodoc",
@@ -40,8 +41,10 @@ exclude_patterns = ["_build", "jupyter_execute", "images/README.md"]
 
 html_theme = "furo"
 html_title = f"glintbsdf {release}"
+html_favicon = "_static/favicon.svg"
 html_static_path = ["_static"]
-html_css_files = ["plugin_pages.css"]
+html_css_files = ["pages.css"]
+html_show_copyright = False
 
 # Roles and substitutions of the plugins' docstrings, which are those of Mitsuba's documentation.
 rst_prolog = """

@@ -4,6 +4,10 @@ r"""
 Diffuse facets of a normal map (:monosp:`glint_diffuse`)
 --------------------------------------------------------
 
+A matt surface with a normal map, which neither flickers nor turns flat in the distance.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,

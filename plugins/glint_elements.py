@@ -4,6 +4,10 @@ r"""
 Glints of Gaussian elements (:monosp:`glint_elements`)
 ------------------------------------------------------
 
+A surface with the normals of a map, or with metallic flakes, whose glints have a roughness.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,

@@ -4,6 +4,10 @@ r"""
 Smooth filters of a normal map (:monosp:`glint_filtered`)
 ---------------------------------------------------------
 
+A normal map as one smooth highlight for each pixel, as games and films have it.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,

@@ -4,6 +4,10 @@ r"""
 Procedural glints and grooves (:monosp:`glint_grid`)
 ----------------------------------------------------
 
+Glitter, snow, sand and brushed metal from a few numbers, without a map.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * - alpha, or alpha_u and alpha_v

@@ -4,6 +4,10 @@ r"""
 Glints of a normal map, exact (:monosp:`glint_manifold`)
 --------------------------------------------------------
 
+A surface with the normals of a map, each of which glints exactly as the map has it.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * Shared: filename, bitmap, data, layer, map_type, height_scale, encoding, flip_y, strength,

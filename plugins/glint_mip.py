@@ -4,6 +4,10 @@ r"""
 Glints of a large map made from a small sample (:monosp:`glint_mip`)
 --------------------------------------------------------------------
 
+A large surface with glints, made from a small sample of its normals.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * - filename

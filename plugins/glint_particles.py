@@ -4,6 +4,10 @@ r"""
 Procedural glitter (:monosp:`glint_particles`)
 ----------------------------------------------
 
+Glitter without a map, from a handful of flakes to more than anyone could count, at one cost.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * - distribution

@@ -4,6 +4,10 @@ r"""
 Path tracer with footprints (:monosp:`glint_path`)
 --------------------------------------------------
 
+Mitsuba's path tracer, in which glints know the size of a pixel at every bounce.
+
+.. pluginpictures::
+
 .. pluginparameters::
 
  * - max_depth
@@ -446,8 +450,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         return [f"{part}.{channel}" for part in parts for channel in "RGB"]
 
     def to_string(self) -> str:
+        max_depth = -1 if self.max_depth == 0xFFFFFFFF else self.max_depth
         return (
-            f"GlintPathIntegrator[\n  max_depth = {self.max_depth},\n"
+            f"GlintPathIntegrator[\n  max_depth = {max_depth},\n"
             f"  rr_depth = {self.rr_depth},\n  separate = {self.separate}\n]"
         )
 

@@ -1,7 +1,8 @@
 """Make every mesh, environment and normal map of the scenes: ``python scenes/make_assets.py``.
 
 The results are committed, so a fresh clone renders without this script. Everything is computed in
-float64 from formulas and fixed seeds; nothing is downloaded. Lengths are scene units, y is up.
+float64 from formulas and fixed seeds, but for a photograph that scikit-image brings along; nothing
+is downloaded. Lengths are scene units, y is up.
 
 UV coordinates measure lengths along the surface (the curved patch apart, whose UVs fill the unit
 square), so that one ``uv_scale`` gives every part of a scene the same size of texel.
@@ -16,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import OpenEXR
+import skimage.data
 import skimage.io
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter
@@ -356,6 +358,24 @@ def car_handle() -> Mesh:
     return tube(path, lambda t: 0.032 + 0 * t, length=length, segments=32, rings=48)
 
 
+def nail() -> Mesh:
+    """A finger nail on the plane y = 0, 0.7 wide and 1.3 long towards -z: arched, with a round tip.
+    UVs are x and -z."""
+
+    def position(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        width = np.sqrt(1 - np.clip((t - 0.7) / 0.6, 0, 1) ** 2.5)
+        x = 0.35 * width * np.sin(1.2 * s) / np.sin(1.2)
+        arch = 0.2 * width * (np.cos(1.2 * s) - np.cos(1.2))
+        return np.stack([x, arch + 0.1 * np.cos(1.1 * (t - 0.4)), -t], axis=-1)
+
+    def uv(s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return position(s, t)[..., [0, 2]] * [1, -1]
+
+    # The tip is a pole, from which the grid keeps away.
+    rows = 1.2999 - 1.2999 * np.linspace(1, 0, 49) ** 2
+    return parametric(position, np.linspace(-1, 1, 33), rows, uv)
+
+
 def cushion(width: float, height: float, depth: float, rounding: float, swelling: float) -> Mesh:
     """An upholstered block about the origin, its edges rounded and its faces swollen.
 
@@ -409,6 +429,7 @@ MESHES = {
     "disc.ply": disc,
     "car_door.ply": car_door,
     "car_handle.ply": car_handle,
+    "nail.ply": nail,
     "sofa_seat.ply": lambda: cushion(1.6, 0.5, 1.6, 0.16, 0.10),
     "sofa_back.ply": lambda: cushion(1.6, 1.2, 0.5, 0.16, 0.12),
     "sofa_arm.ply": lambda: cushion(0.45, 1.1, 1.9, 0.2, 0.03),
@@ -593,6 +614,8 @@ def main(folder: Path) -> None:
     write_exr(folder / "textures" / "leather.exr", {"Y": leather_height()})
     write_exr(folder / "textures" / "wood_height.exr", {"Y": wood_height()})
     skimage.io.imsave(folder / "textures" / "wood.png", np.uint8(np.round(255 * wood_colour())))
+    # A photograph of gravel, in the public domain (CC0)
+    skimage.io.imsave(folder / "textures" / "gravel.png", skimage.data.gravel())
     for name, make in NORMAL_MAPS.items():
         normals = make().normals
         write_exr(folder / "maps" / name, {"R": normals[..., 0], "G": normals[..., 1]})

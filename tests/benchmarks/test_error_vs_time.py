@@ -293,6 +293,19 @@ for (const mark of document.querySelectorAll('figure [id*="--"]')) {
 document.documentElement.dataset.shown = shown;
 Promise.all([...document.images].map(image => image.decode())).then(
   () => { document.documentElement.dataset.images = document.images.length; });
+const whole = document.documentElement.outerHTML;
+if (window === top) for (const width of [1300, 400]) {  // a desk and a phone
+  const frame = document.createElement("iframe");
+  frame.style.width = `${width}px`;
+  frame.style.border = 0;
+  frame.onload = () => {
+    const needed = frame.contentDocument.documentElement.scrollWidth;
+    document.documentElement.dataset[`at${width}`] = needed <= width ? "fits" : needed;
+    frame.remove();
+  };
+  frame.srcdoc = whole;
+  document.body.append(frame);
+}
 </script>
 """
 
@@ -320,4 +333,5 @@ def test_page_works_in_a_browser(folder, tmp_path):
     assert marks == 4 * 4 + 2 * 6
     assert f'data-shown="{marks}"' in document
     assert re.search(r'data-images="\d+"', document), "every picture decodes"
+    assert 'data-at1300="fits"' in document and 'data-at400="fits"' in document
     assert done.stdout.count("<svg") == 4 + 1 + 1

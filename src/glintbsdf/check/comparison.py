@@ -65,6 +65,9 @@ class Comparison:
             f"{self.queries} queries in {self.seconds:.3g} s ({self.queries / self.seconds:.3g}/s)"
         )
 
+    def __repr__(self) -> str:
+        return f"Comparison({self.title}: {str(self).replace(chr(10), '; ')})"
+
     @property
     def difference(self) -> float:
         """The relative L1 difference ``Σ|density - reference| / Σ reference``."""

@@ -30,7 +30,7 @@ class Example:
 
     name: str
     title: str
-    made: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
+    made: Mapping[str, Callable[[Path], None]] = field(default_factory=dict, repr=False)
 
     def copy(self, folder: str | Path) -> list[Path]:
         """Write the scene and its files to a folder, which must not exist or be empty.

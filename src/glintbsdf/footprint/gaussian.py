@@ -40,6 +40,14 @@ class Footprint:
         self.du = mi.Vector2f(du)
         self.dv = mi.Vector2f(dv)
 
+    def __repr__(self) -> str:
+        vectors = {"uv": mi.Vector2f(self.uv), "du": self.du, "dv": self.dv}
+        count = max(dr.width(v) for v in vectors.values())
+        if count != 1 or dr.flag(dr.JitFlag.SymbolicScope):  # while recording there are no numbers
+            return f"Footprint({count} of them)"
+        told = (f"{name}=({v.x[0]:.4g}, {v.y[0]:.4g})" for name, v in vectors.items())
+        return f"Footprint({', '.join(told)})"
+
     @classmethod
     def isotropic(cls, uv: mi.Point2f, sigma_uv: float | mi.Float) -> Footprint:
         """A round footprint with standard deviation ``sigma_uv`` (UV units, ≥ 0) in each axis."""

@@ -76,6 +76,11 @@ class Query:
         self.parameters, self.place = dict(parameters or {}), place
         self._derived: dict[Hashable, object] = {}
 
+    def __repr__(self) -> str:
+        names = [name for name in ("turn", "place") if getattr(self, name) is not None]
+        names += [*["spread"] * bool(self.spread), *self.parameters]
+        return f"Query({', '.join([repr(self.footprint), *names])})"
+
     @staticmethod
     def of(question: Query | Footprint) -> Query:
         """A query as it is, or the plain query of a footprint."""
