@@ -11,7 +11,13 @@ import pytest
 
 from glintbsdf.core.errors import ParameterError
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import KERNELS, SIGMA_MIN, TexelKernel, limit_extent
+from glintbsdf.footprint.kernels import (
+    KERNELS,
+    SIGMA_MIN,
+    TexelKernel,
+    gaussian_like,
+    limit_extent,
+)
 
 WIDTH, HEIGHT = 128, 64
 
@@ -24,10 +30,13 @@ FOOTPRINTS = {
 }
 
 
-def texel_kernel(kernel, axes, uv=(0.4, 0.6), wrap_mode="repeat"):
+def footprint_of(axes, uv=(0.4, 0.6)):
     du, dv = ((x / WIDTH, y / HEIGHT) for x, y in axes)
-    footprint = Footprint(mi.Point2f(uv), mi.Vector2f(du), mi.Vector2f(dv))
-    return TexelKernel(kernel, footprint, HEIGHT, WIDTH, wrap_mode)
+    return Footprint(mi.Point2f(uv), mi.Vector2f(du), mi.Vector2f(dv))
+
+
+def texel_kernel(kernel, axes, uv=(0.4, 0.6), wrap_mode="repeat"):
+    return TexelKernel(kernel, footprint_of(axes, uv), HEIGHT, WIDTH, wrap_mode)
 
 
 def covariance(axes):
@@ -97,6 +106,15 @@ def test_row_extent_is_tight(variant, kernel, axes):
         if kernel != "gaussian":  # whose tails are thinly sampled
             assert x[inside].min() - left < 0.1 * (right - left)
             assert right - x[inside].max() < 0.1 * (right - left)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gaussian_in_place_of_a_kernel_has_its_covariance(variant, kernel):
+    axes = FOOTPRINTS["rotated"]
+    of_samples = np.cov(samples(texel_kernel(kernel, axes)))
+    footprint = gaussian_like(kernel, footprint_of(axes))
+    ours = [np.array(axis).ravel() * (WIDTH, HEIGHT) for axis in (footprint.du, footprint.dv)]
+    assert np.allclose(covariance(ours), of_samples, atol=0.02 * of_samples.max())
 
 
 def test_limit_extent_keeps_the_width_of_a_long_footprint(variant):

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from glintbsdf.check.comparison import Comparison
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import NormalMap, wrapped
 
 #: Colours are spread by this power of the density. Without it, a few peaks leave all else black.
 _GAMMA = 0.5
@@ -110,8 +110,8 @@ def draw_footprint(axis: Axes, normal_map: NormalMap, seen: Footprint) -> None:
     column, row = (
         np.arange(np.floor(c - reach), np.ceil(c + reach) + 1, step).astype(int) for c in centre
     )
-    rows = _wrapped(row, normal_map.height, normal_map.wrap_mode)
-    columns = _wrapped(column, normal_map.width, normal_map.wrap_mode)
+    rows = wrapped(row, normal_map.height, normal_map.wrap_mode)
+    columns = wrapped(column, normal_map.width, normal_map.wrap_mode)
     s = normal_map.normals[np.ix_(rows, columns)]
     z = np.sqrt(np.maximum(1 - (s**2).sum(axis=2, keepdims=True), 0))
     axis.imshow(
@@ -125,16 +125,6 @@ def draw_footprint(axis: Axes, normal_map: NormalMap, seen: Footprint) -> None:
             Ellipse(centre, across, along, angle=angle, fill=False, color="black", linestyle=style)
         )
     axis.set(title="footprint on the map: 1 σ, 3 σ", xlabel="texels", ylabel="texels")
-
-
-def _wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
-    """Texels of a map for indices outside of it."""
-    if wrap_mode == "clamp":
-        return np.clip(index, 0, count - 1)
-    if wrap_mode == "mirror":
-        index = index % (2 * count)
-        return np.minimum(index, 2 * count - 1 - index)
-    return index % count
 
 
 def errors(

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from glintbsdf.core.errors import check, check_choice
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import NormalMap, wrapped
 
 KERNELS = ("gaussian", "disk", "box")
 
@@ -235,8 +235,8 @@ def _normals_at(position: Array, vertices: Array, normal_map: NormalMap, epsilon
     in_first = s + t <= 1
 
     def vertex(row_offset: int | Array, column_offset: int | Array) -> Array:
-        rows = _wrap(row + row_offset, normal_map.height, normal_map.wrap_mode)
-        columns = _wrap(column + column_offset, normal_map.width, normal_map.wrap_mode)
+        rows = wrapped(row + row_offset, normal_map.height, normal_map.wrap_mode)
+        columns = wrapped(column + column_offset, normal_map.width, normal_map.wrap_mode)
         return vertices[rows * normal_map.width + columns]
 
     # The corners in the order of their triangle: (n0, n1, n2) or (n3, n2, n1).
@@ -261,13 +261,3 @@ def _normals_at(position: Array, vertices: Array, normal_map: NormalMap, epsilon
 def _clamped_circumradius(epsilon: float) -> float:
     """Circumradius of an equilateral triangle of twice the area ``epsilon``."""
     return float(np.sqrt(2 * epsilon / (3 * np.sqrt(3))))
-
-
-def _wrap(index: npt.NDArray[np.int64], size: int, wrap_mode: str) -> npt.NDArray[np.int64]:
-    """The texel at any index."""
-    if wrap_mode == "clamp":
-        return np.clip(index, 0, size - 1)
-    if wrap_mode == "mirror":
-        index = index % (2 * size)
-        return np.minimum(index, 2 * size - 1 - index)
-    return index % size

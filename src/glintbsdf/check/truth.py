@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check
-from glintbsdf.maps.normalmap import NormalMap
+from glintbsdf.maps.normalmap import NormalMap, wrapped
 
 #: Roughness of the mirrors: a tenth of the radius of the sun's half vectors.
 ALPHA = 2e-4
@@ -100,16 +100,6 @@ def refined(normal_map: NormalMap, subdivisions: int) -> np.ndarray:
     upper = n0 + u * (n1 - n0) + t * (n2 - n0)
     lower = n3 + (1 - u) * (n2 - n3) + (1 - t) * (n1 - n3)
     return np.where(u + t <= 1, upper, lower)
-
-
-def wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
-    """The texel at any index."""
-    if wrap_mode == "clamp":
-        return np.clip(index, 0, count - 1)
-    if wrap_mode == "mirror":
-        index = index % (2 * count)
-        return np.minimum(index, 2 * count - 1 - index)
-    return index % count
 
 
 def slope_moments(

@@ -304,3 +304,17 @@ class TexelKernel:
             return dr.fma(self.shear, v, sign * half)
 
         return edge(-1), edge(1)
+
+
+def gaussian_like(kernel: str, footprint: Footprint) -> Footprint:
+    """The footprint whose Gaussian, without a cut, has the covariance of ``kernel`` under
+    ``footprint``.
+
+    The box has the footprint's variances along u and v, times its own, and no covariance.
+    """
+    width = sqrt(VARIANCE[kernel])
+    if kernel == "box":
+        u = dr.norm(mi.Vector2f(footprint.du.x, footprint.dv.x))
+        v = dr.norm(mi.Vector2f(footprint.du.y, footprint.dv.y))
+        return Footprint(footprint.uv, mi.Vector2f(width * u, 0), mi.Vector2f(0, width * v))
+    return Footprint(footprint.uv, width * footprint.du, width * footprint.dv)

@@ -355,3 +355,13 @@ def _as_array(data: Any, owner: str, parameter: str) -> np.ndarray:
 
 def _shape_and_type(array: np.ndarray) -> str:
     return f"{' x '.join(map(str, array.shape)) or 'a scalar'}, {array.dtype}"
+
+
+def wrapped(index: np.ndarray, count: int, wrap_mode: str) -> np.ndarray:
+    """The texels that stand at any indices along an axis of ``count`` texels."""
+    if wrap_mode == "clamp":
+        return np.clip(index, 0, count - 1)
+    if wrap_mode == "mirror":
+        index = index % (2 * count)
+        return np.minimum(index, 2 * count - 1 - index)
+    return index % count

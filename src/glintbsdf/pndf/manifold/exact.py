@@ -8,7 +8,6 @@ footprint, which inverted lists find. Sampling is Eq. 6.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,7 @@ import numpy as np
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import VARIANCE
+from glintbsdf.footprint.kernels import gaussian_like
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap
 from glintbsdf.microfacet.masking import SmithMasking
@@ -140,11 +139,10 @@ class Manifold(TexelMesh, PNDF):
 
     def query_of_stand_in(self, question: Query | Footprint) -> Query:
         """The query with a narrower footprint: the Gaussian with the variance of this kernel."""
-        query, width = Query.of(question), sqrt(VARIANCE[self.kernel])
+        query = Query.of(question)
 
         def narrowed() -> Query:
-            seen = query.footprint
-            return query.at(Footprint(seen.uv, seen.du * width, seen.dv * width))
+            return query.at(gaussian_like(self.kernel, query.footprint))
 
         return query.once(("stand-in", self.kernel), narrowed)
 

@@ -45,7 +45,7 @@ from glintbsdf.core.hashing import pcg3d
 from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
-from glintbsdf.footprint.kernels import VARIANCE, TexelKernel, difference_of_products
+from glintbsdf.footprint.kernels import TexelKernel, difference_of_products, gaussian_like
 from glintbsdf.footprint.lattice import Lattice, floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.microfacet.masking import MeanPlaneMasking
@@ -727,7 +727,7 @@ class GgxFit(FootprintArea):
     distribution where it is seen from the front (:func:`~.area_of_moments`).
 
     Mean slope and covariance are averages over the footprint, by a :class:`~.MomentPyramid`. The
-    Gaussian with the kernel's covariance replaces the kernel (:func:`gaussian_like`). Small
+    Gaussian with the kernel's covariance replaces the kernel (:func:`~.gaussian_like`). Small
     footprints (:data:`FINE_QUADS`) use :func:`mean_over_points` instead.
 
     The pyramid is not cached on disk, as building it takes less time than reading it.
@@ -777,7 +777,7 @@ class GgxFit(FootprintArea):
         by_points = mean_over_points(self.mesh, kernel, directions, active & fine, self.jumps)
         if self.pyramid is None:
             return by_points
-        gaussian = gaussian_like(kernel, query.footprint)
+        gaussian = gaussian_like(kernel.kernel, query.footprint)
         x, y, xx, yy, xy = self.pyramid.average(gaussian, active & ~fine)
         slope = mi.Vector2f(x, y)
         areas = [
@@ -788,19 +788,6 @@ class GgxFit(FootprintArea):
 
     def __repr__(self) -> str:
         return f"ggx_fit[{sum(self.parts().values()) / 2**20:.1f} MiB]"
-
-
-def gaussian_like(kernel: TexelKernel, footprint: Footprint) -> Footprint:
-    """The Gaussian, without a cut, that has the covariance of a kernel under ``footprint``.
-
-    The box has the footprint's variances along u and v, times its own, and no covariance.
-    """
-    width = sqrt(VARIANCE[kernel.kernel])
-    if kernel.kernel == "box":
-        u = dr.norm(mi.Vector2f(footprint.du.x, footprint.dv.x))
-        v = dr.norm(mi.Vector2f(footprint.du.y, footprint.dv.y))
-        return Footprint(footprint.uv, mi.Vector2f(width * u, 0), mi.Vector2f(0, width * v))
-    return Footprint(footprint.uv, width * footprint.du, width * footprint.dv)
 
 
 def slopes_of_quad(normals, epsilon: float) -> list:
