@@ -8,9 +8,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
 
 import glintbsdf
+from glintbsdf.check.comparison import Comparison
+from glintbsdf.check.reference import BinnedPNDF
+from glintbsdf.check.truth import Truth
+from glintbsdf.examples import EXAMPLES
+from glintbsdf.footprint.query import Query
 
 ROOT = Path(__file__).parents[1]
 
@@ -64,6 +71,34 @@ def test_a_bsdf_loads_what_reads_its_file_and_no_more(variant, tmp_path):
 def test_public_names_load_on_first_use(name):
     assert getattr(glintbsdf, name) is not None
     assert name in dir(glintbsdf)
+
+
+def test_what_a_notebook_shows_is_short(variant):
+    """The last value of a notebook's cell is shown by its ``repr``: a few lines, and no arrays."""
+    normal_map = glintbsdf.maps.scratched(16, length=8, width=2, seed=2)
+    uv, du = mi.Point2f(0.5, 0.25), mi.Vector2f(0.01, 0)
+    footprint = glintbsdf.Footprint(uv, du, mi.Vector2f(0, 0.02))
+    many = glintbsdf.Footprint(mi.Point2f(mi.Float([0.1, 0.2]), 0), du, du)
+    ones = np.ones((8, 8))
+    binned = BinnedPNDF(ones, 0.1 * ones, ((-1, -0.5), (1, 0.5)))
+    compared = Comparison("a title", ones, ones, binned, 64, 0.5, footprint, normal_map)
+    shown = {
+        repr(footprint): "uv=(0.5, 0.25), du=(0.01, 0), dv=(0, 0.02)",
+        repr(many): "2 of them",
+        repr(Query(many, spread=(du,))): "2 of them), spread",
+        repr(binned): "8 × 8 bins, x -1 to 1, y -0.5 to 0.5, noise 7.98%",
+        repr(compared): "a title: relative L1 difference 0.00%",
+        repr(
+            Truth(np.ones((4, 6, 3)), np.full((4, 6, 3), 0.02))
+        ): "4 × 6 × 3, relative error 2.00%",
+        repr(normal_map): "16 x 16",
+        repr(EXAMPLES["vase"]): "vase",
+        repr(mi.load_dict({"type": "glint_path"})): "max_depth = -1",
+        repr(mi.load_dict({"type": "glint_manifold", "data": mi.TensorXf(ones[..., None])})): "8×8",
+    }
+    for text, part in shown.items():
+        assert part in text
+        assert len(text) < 400 and max(map(len, text.splitlines())) < 180, text
 
 
 def test_unknown_name_is_an_attribute_error():

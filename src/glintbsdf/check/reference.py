@@ -46,6 +46,14 @@ class BinnedPNDF:
     standard_error: Array
     bounds: Bounds
 
+    def __repr__(self) -> str:
+        (x_min, y_min), (x_max, y_max) = self.bounds
+        rows, columns = self.density.shape
+        return (
+            f"BinnedPNDF({rows} × {columns} bins, x {x_min:.3g} to {x_max:.3g}, "
+            f"y {y_min:.3g} to {y_max:.3g}, noise {self.noise_floor:.2%})"
+        )
+
     def __iter__(self) -> Iterator[Array]:
         return iter((self.density, self.standard_error))
 

@@ -150,6 +150,10 @@ class Truth:
     image: np.ndarray
     standard_error: np.ndarray
 
+    def __repr__(self) -> str:
+        size = " × ".join(map(str, self.image.shape))
+        return f"Truth({size}, relative error {self.relative_error:.2%})"
+
     @property
     def relative_error(self) -> float:
         """Standard deviation of the noise over the mean of the image, both over all pixels."""
