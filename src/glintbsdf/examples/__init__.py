@@ -81,7 +81,7 @@ def _scratched_map(path: Path) -> None:
     from glintbsdf.maps import procedural
 
     normals = procedural.scratched(
-        1024, coverage=0.5, length=500.0, width=3.0, slope=0.5, alpha=0.12, seed=3
+        512, coverage=0.5, length=400.0, width=3.0, slope=0.5, alpha=0.12, seed=3
     ).normals
     colours = np.concatenate([normals, np.ones_like(normals[..., :1])], axis=2)
     # Two of three channels say all, but programs that show images want three.
