@@ -781,10 +781,8 @@ class Elements(Mixture):
     def build_lists(self) -> dict[str, np.ndarray]:
         """The lists of cells, by normal."""
         blocks = BlocksOfEllipses(self.lattice, self.ellipses, len(self.places))
-        normals = self.data.numpy().reshape(-1, 2)
-        return Builder(
-            blocks, normals, self.normal_bounds(), BYTES_PER_CELL[len(self.places) > 1]
-        ).arrays()
+        allowed = BYTES_PER_CELL[len(self.places) > 1]
+        return Builder(blocks, dr.detach(self.data.array), self.normal_bounds(), allowed).arrays()
 
     def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The rectangle (lower, upper) that holds the ellipses of all cells, and a margin.

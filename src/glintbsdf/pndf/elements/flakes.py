@@ -186,7 +186,8 @@ class Flakes(Mixture):
         blocks = BlocksOfFlakes(self.lattice, ellipses, occupied, self.count)
 
         def build_lists(allowed: float = BYTES_OF_LISTS) -> dict[str, np.ndarray]:
-            return Builder(blocks, self.flake_normals, self.normal_bounds(), allowed).arrays()
+            normals = stored(mi.Float, self.flake_normals.astype(np.float32).ravel())
+            return Builder(blocks, normals, self.normal_bounds(), allowed).arrays()
 
         key = self.count, self.flake_alpha[0], self.seed, self.sigma_r[0]
         self.lists = QuadLists(self.lattice, self.cached(build_lists, *key))

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from math import inf
+
 import drjit as dr
 import mitsuba as mi
 
+from glintbsdf.footprint.kernels import difference_of_products
 from glintbsdf.pndf.index.lists import BlocksOfQuads, Window
 
 
@@ -28,20 +32,25 @@ class BlocksOfEllipses(BlocksOfQuads):
         return centre - half, centre + half
 
     @staticmethod
-    def meets(ellipse, centre, half):
-        """Whether an octagon around an ellipse meets a rectangle, by the test of separating axes.
+    def span(ellipse) -> Callable:
+        """As for triangles. No digits cancel, however thin the ellipse is."""
+        centre, p, q = ellipse
+        xx, yy = (dr.fma(a, a, b * b) for a, b in zip(p, q, strict=True))
+        xy, half = dr.fma(p.x, p.y, q.x * q.y), dr.sqrt(xx)
+        # x of the highest point from the centre; the lowest is opposite.
+        summit, slope, inverse = xy * dr.rsqrt(yy), xy / xx, 1 / half
+        height = dr.abs(difference_of_products(p.x, q.y, p.y, q.x)) * inverse
 
-        ``centre``, ``half`` (``mi.Vector2f``): centre and half extents of the rectangle. The area
-        of the octagon is a twentieth larger than that of the ellipse. It is regular if the ellipse
-        is round. No digits cancel, however thin the ellipse is.
-        """
-        lower, upper = BlocksOfEllipses.extent(ellipse)
-        meets = dr.all((lower <= centre + half) & (upper >= centre - half))
-        middle, p, q = ellipse
-        offset = middle - centre
-        for tangent in (p, q, p + q, p - q):
-            normal = mi.Vector2f(-tangent.y, tangent.x)
-            a, b = dr.dot(normal, p), dr.dot(normal, q)
-            reach = dr.sqrt(dr.fma(a, a, b * b)) + dr.dot(dr.abs(normal), half)
-            meets &= dr.abs(dr.dot(normal, offset)) <= reach
-        return meets
+        def between(left, right):
+            first, last = dr.maximum(left - centre.x, -half), dr.minimum(right - centre.x, half)
+
+            def y(x, sign):
+                x = dr.clip(x, first, last)
+                rise = height * dr.safe_sqrt(1 - dr.square(x * inverse))
+                return dr.fma(slope, x, dr.fma(sign, rise, centre.y))
+
+            within = first <= last
+            lowest, highest = y(-summit, -1), y(summit, 1)
+            return dr.select(within, lowest, inf), dr.select(within, highest, -inf)
+
+        return between

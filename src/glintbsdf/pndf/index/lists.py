@@ -10,7 +10,9 @@ are near in position and in normal.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
+from math import inf
 from operator import or_
 from typing import NamedTuple
 
@@ -19,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.core.opaque import stored
+from glintbsdf.core.opaque import opaque, stored
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.lattice import BLOCK, Lattice, floor_int
@@ -190,12 +192,19 @@ class NormalCells:
         self.cell_of_y = stored(mi.UInt32, cell_of_y.astype(np.uint32).ravel())
 
     @staticmethod
-    def histogram(normals: np.ndarray, lower, upper) -> np.ndarray:
-        """Number of ``normals`` (N, 2) in each pixel of the tables: an array over x and y."""
-        pixel = ((normals - lower) * (RESOLUTION / (upper - lower))).astype(np.int64)
-        x, y = np.clip(pixel, 0, RESOLUTION - 1).T
-        counts = np.bincount(x * RESOLUTION + y, minlength=RESOLUTION**2)
-        return counts.reshape(RESOLUTION, RESOLUTION)
+    def histogram(normals, lower, upper) -> np.ndarray:
+        """Number of ``normals`` (``mi.Float``, x and y by turns) in each pixel of the tables: an
+        array over x and y."""
+        count = dr.arange(mi.UInt32, dr.width(normals) // 2)
+        scale = (RESOLUTION / (upper - lower)).astype(np.float32)
+        pixel = []
+        for k in (0, 1):
+            origin, pixels = (opaque(mi.Float, float(v[k])) for v in (lower, scale))
+            place = (dr.gather(mi.Float, normals, 2 * count + k) - origin) * pixels
+            pixel.append(mi.UInt32(dr.clip(place, 0, RESOLUTION - 1)))
+        counts = dr.zeros(mi.UInt32, RESOLUTION**2)
+        dr.scatter_add(counts, mi.UInt32(1), pixel[0] * RESOLUTION + pixel[1])
+        return counts.numpy().reshape(RESOLUTION, RESOLUTION)
 
     @staticmethod
     def tables(histogram: np.ndarray, divisions: int):
@@ -357,7 +366,7 @@ class QuadLists:
     def build(
         lattice: Lattice,
         triangles,
-        normals: np.ndarray,
+        normals: mi.Float,
         bounds,
         window: Window | None = None,
         bytes_per_quad: float = BYTES_PER_QUAD,
@@ -367,7 +376,7 @@ class QuadLists:
         Args:
             triangles: function ``(row, column, active)`` that returns the triangles of a stored
                 quad, each as a vertex and two edges (``mi.Vector2f``).
-            normals: projected normals of the map, (N, 2).
+            normals: projected normals of the map (``mi.Float``, x and y by turns).
             bounds: rectangle (lower, upper) of projected normals that holds all triangles.
             window: the blocks to make lists for, by default all.
             bytes_per_quad: memory allowed.
@@ -385,7 +394,8 @@ class Blocks:
     Attributes:
         rows, columns (int): number of blocks along each axis.
         mean_count (float): mean number of items in a block.
-        largest_entry (int): the largest entry that the lists may hold.
+        largest_entry, longest_list (int): the largest entry that the lists may hold, and the most
+            entries in one list.
         shapes_each (int): number of shapes of an item.
     """
 
@@ -399,19 +409,29 @@ class Blocks:
         return dr.minimum(dr.minimum(a, b), c), dr.maximum(dr.maximum(a, b), c)
 
     @staticmethod
-    def meets(triangle, centre, half):
-        """Whether a shape meets a rectangle with this centre and these half extents."""
+    def span(triangle) -> Callable:
+        """The part of a shape between two x: a function ``(left, right)`` that returns its lowest
+        and its highest y. The lowest exceeds the highest where there is no such part."""
         a, e1, e2 = triangle
-        a = a - centre
-        b, c = a + e1, a + e2
-        lower, upper = Blocks.extent((a, e1, e2))
-        meets = dr.all((lower <= half) & (upper >= -half))
-        for on_edge, edge, opposite in ((a, e1, c), (a, e2, b), (b, c - b, a)):
-            normal = mi.Vector2f(-edge.y, edge.x)  # a candidate for a separating axis
-            radius = dr.dot(dr.abs(normal), half)
-            p, q = dr.dot(normal, on_edge), dr.dot(normal, opposite)
-            meets &= (dr.minimum(p, q) <= radius) & (dr.maximum(p, q) >= -radius)
-        return meets
+        edges = []
+        for start, edge in ((a, e1), (a, e2), (a + e1, e2 - e1)):
+            run = dr.select(dr.abs(edge.x) < 1e-12, 1e-12, edge.x)  # a vertical edge leans a bit
+            edges.append((start, edge.y, 1 / run))
+
+        def between(left, right):
+            lowest, highest = mi.Float(inf), mi.Float(-inf)
+            for start, rise, inverse in edges:
+                # The fractions of the edge between which it lies within.
+                enter, leave = ((x - start.x) * inverse for x in (left, right))
+                first = dr.maximum(dr.minimum(enter, leave), 0)
+                last = dr.minimum(dr.maximum(enter, leave), 1)
+                ends = [dr.fma(t, rise, start.y) for t in (first, last)]
+                within = first <= last
+                lowest = dr.select(within, dr.minimum(lowest, dr.minimum(*ends)), lowest)
+                highest = dr.select(within, dr.maximum(highest, dr.maximum(*ends)), highest)
+            return lowest, highest
+
+        return between
 
 
 class BlocksOfQuads(Blocks):
@@ -422,7 +442,9 @@ class BlocksOfQuads(Blocks):
         self.lattice, self.shapes_of_quad = lattice, shapes
         self.window = window
         self.rows, self.columns = window.rows.size, window.columns.size
-        self.mean_count, self.largest_entry = float(BLOCK**2), lattice.x.quads * BLOCK
+        self.mean_count = float(BLOCK**2)
+        self.longest_list = self.columns * BLOCK**2
+        self.largest_entry = self.window.columns.all * BLOCK**2 - 1
 
     def count(self, block_row, block_column):
         """Number of quads in a block."""
@@ -450,7 +472,8 @@ class Builder:
 
     Args:
         blocks (Blocks): the items.
-        normals: projected normals of the map, (N, 2), by which cells are placed.
+        normals: projected normals of the map (``mi.Float``, x and y by turns), by which cells are
+            placed.
         bounds: rectangle (lower, upper) of projected normals that holds all shapes.
         bytes_per_quad (float): memory allowed to the lists, per item.
     """
@@ -460,45 +483,44 @@ class Builder:
         self.lower, self.upper = (np.asarray(v, np.float32) for v in bounds)
         self.histogram = NormalCells.histogram(normals, self.lower, self.upper)
         self.rows, self.columns = blocks.rows, blocks.columns
+        self.entry_type = np.dtype(np.uint16 if blocks.largest_entry < 1 << 16 else np.uint32)
+        # No list is longer than a row of blocks.
+        self.offset_type = np.dtype(np.uint16 if blocks.longest_list < 1 << 16 else np.uint32)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Build the arrays of :class:`QuadLists`."""
+        """Build the arrays of :class:`QuadLists`, strip by strip."""
         estimates = ((n, self.bytes_per_quad(n)) for n in DIVISIONS)
         divisions, per_quad = next(e for e in estimates if e[0] == 1 or e[1] <= self.allowed)
         tables = self.use(divisions)
-        cells = divisions**2
-        index_type = np.uint16 if self.blocks.largest_entry < 1 << 16 else np.uint32
+        lists, width = self.rows * divisions**2, self.columns + 1
 
-        offset = np.zeros((self.rows, cells, self.columns + 1), index_type)
-        total = np.zeros((self.rows, cells), np.int64)
-        step = max(1, STRIP_COUNTERS // (cells * (self.columns + 1)))
-        strips = [slice(k, min(k + step, self.rows)) for k in range(0, self.rows, step)]
+        start = np.empty(lists, np.uint32)
+        # Of an even length each, as two share a word.
+        offset = np.zeros(lists * width + lists * width % 2, self.offset_type)
+        entries, total = np.empty(0, self.entry_type), 0
+        step = max(1, STRIP_COUNTERS // (divisions**2 * width))
         items = self.rows * self.columns * self.blocks.mean_count
         with progress("Building lists of quads", items * per_quad) as report:
-            for done, strip in enumerate(strips):
-                counts = self.scan_strip(strip, np.zeros_like(offset[strip], np.uint32))
-                ends = np.cumsum(counts, axis=-1, dtype=np.uint32)
-                offset[strip, :, 1:] = ends[..., :-1]
-                total[strip] = ends[..., -1]
-                report(0.5 * (done + 1) / len(strips))
-            start = np.cumsum(total.ravel()) - total.ravel()
-
-            entries = np.empty(total.sum(), index_type)
-            for done, strip in enumerate(strips):
-                first = start[strip.start * cells]
-                count = total[strip].sum()
-                place = start.reshape(total.shape)[strip, :, None] - first + offset[strip]
-                entries[first : first + count] = self.scan_strip(
-                    strip, place.astype(np.uint32), count
-                )
-                report(0.5 + 0.5 * (done + 1) / len(strips))
+            for first in range(0, self.rows, step):
+                last = min(first + step, self.rows)
+                own = slice(first * divisions**2, last * divisions**2)
+                begin, offsets, found = self.strip(first, last)
+                start[own] = begin + np.uint32(total)
+                offset[own.start * width : own.stop * width] = offsets
+                # The system moves a large array without a copy.
+                entries.resize(total + len(found), refcheck=False)
+                entries[total:] = found
+                total += len(found)
+                report(last / self.rows)
+            entries.resize(total + total % 2, refcheck=False)
+        dr.flush_malloc_cache()
         return {
             "lower": self.lower,
             "upper": self.upper,
             "slab_of_x": tables[0],
             "cell_of_y": tables[1],
-            "start": start.astype(np.uint32),
-            "offset": offset.ravel(),
+            "start": start,
+            "offset": offset,
             "entries": entries,
         }
 
@@ -514,7 +536,8 @@ class Builder:
 
         Where the offsets alone take more than is allowed, nothing is sampled.
         """
-        offsets = (2 + 6 / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
+        size = self.offset_type.itemsize
+        offsets = (size + (size + 4) / (self.columns + 1)) * divisions**2 / self.blocks.mean_count
         if offsets > self.allowed:
             return offsets
         self.use(divisions)
@@ -523,104 +546,102 @@ class Builder:
         if count > SAMPLED_BLOCKS:
             sample = np.random.default_rng(0).integers(0, count, SAMPLED_BLOCKS)
         row, column = (stored(mi.UInt32, v.astype(np.uint32)) for v in divmod(sample, self.columns))
-        counter = dr.zeros(mi.UInt32, 1)
-        self.scan(row, column, lambda cell: mi.UInt32(0), counter)
-        return 2 * counter[0] / (len(sample) * self.blocks.mean_count) + offsets
+        counters, own = dr.zeros(mi.UInt32, len(sample)), dr.arange(mi.UInt32, len(sample))
+        self.scan(row, column, lambda cell: own, counters)
+        entries = dr.sum(counters)[0] / (len(sample) * self.blocks.mean_count)
+        return self.entry_type.itemsize * entries + offsets
 
-    def scan_strip(self, strip: slice, counters: np.ndarray, entries: int | None = None):
-        """Scan the rows of blocks of a strip.
+    def strip(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The lists of a strip, the rows of blocks from ``first`` to before ``last``.
 
-        Without ``entries``, ``counters`` (rows, cells, columns + 1) count the quads of each list
-        and block, and are returned. With ``entries``, the total number of entries, each counter is
-        the index of the next entry of its list and block, and the filled entries are returned.
+        Returns the index of each list's first entry, within the strip; the first entry of each
+        block, counted from the start of its list; and the entries.
         """
-        shape = counters.shape
-        block = dr.arange(mi.UInt32, (strip.stop - strip.start) * self.columns)
-        columns = dr.opaque(mi.UInt32, self.columns)
+        block = dr.arange(mi.UInt32, (last - first) * self.columns)
+        columns, cells = (dr.opaque(mi.UInt32, n) for n in (self.columns, self.cells.divisions**2))
+        width = columns + 1
         row = block // columns
         column = block - row * columns
-        cells, width = (dr.opaque(mi.UInt32, n) for n in shape[1:])
-        counters = stored(mi.UInt32, counters.ravel())
-        filled = None if entries is None else dr.zeros(mi.UInt32, max(int(entries), 1))
-        self.scan(
-            row + dr.opaque(mi.UInt32, strip.start),
-            column,
-            lambda cell: (row * cells + cell) * width + column,
-            counters,
-            filled,
-        )
-        if filled is None:
-            return counters.numpy().reshape(shape)
-        return filled.numpy()[:entries]
+
+        def scan(counters, entries=None) -> None:
+            self.scan(
+                row + dr.opaque(mi.UInt32, first),
+                column,
+                lambda cell: (row * cells + cell) * width + column,
+                counters,
+                entries,
+            )
+
+        # First the quads of each list and block are counted, then each is entered in its place.
+        lists = (last - first) * self.cells.divisions**2
+        counters = dr.zeros(mi.UInt32, lists * (self.columns + 1))
+        scan(counters)
+        places = dr.prefix_sum(counters)
+        count = places[-1] + counters[-1]
+        begin = dr.gather(mi.UInt32, places, dr.arange(mi.UInt32, lists) * width)
+        of_list = dr.arange(mi.UInt32, dr.width(counters)) // width
+        offset = places - dr.gather(mi.UInt32, places, of_list * width)
+        entries = dr.empty(mi.UInt32, max(count, 1))
+        dr.eval(begin, offset)
+        scan(places, entries)
+        return begin.numpy(), offset.numpy(), entries.numpy()[:count]
 
     def scan(self, block_row, block_column, counter_of_cell, counters, entries=None) -> None:
-        """Count the quads of the given blocks in all cells that they reach, or enter them there."""
+        """Count the quads of the given blocks in all cells that they reach, or enter them there.
+
+        ``counters`` count the quads of each list and block. With ``entries``, each counter is the
+        index of the next entry of its list and block.
+        """
         cells, blocks = self.cells, self.blocks
         count = blocks.count(block_row, block_column)
 
-        def cell_range(slab, lower, upper, active):
-            return (
-                mi.Int(cells.cell_in_slab(mi.UInt32(slab), lower - MARGIN, active)),
-                mi.Int(cells.cell_in_slab(mi.UInt32(slab), upper + MARGIN, active)),
-            )
+        def loop(first, condition, body, label) -> None:
+            dr.while_loop((first,), condition, body, mode="symbolic", label=label)
 
-        def next_quad(quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active):
-            quad = quad + 1
-            active = active & (quad < count)
-            exists, shapes = blocks.shapes(block_row, block_column, quad, active)
-            shapes = tuple(tuple(mi.Vector2f(v) for v in shape) for shape in shapes)
+        def each_quad(quad):
+            exists, shapes = blocks.shapes(block_row, block_column, quad, mi.Bool(True))
             lower, upper = zip(*(blocks.extent(shape) for shape in shapes), strict=True)
-            lowest, highest = reduce(dr.minimum, lower), reduce(dr.maximum, upper)
-            slab = mi.Int(cells.slab(lowest.x - MARGIN, exists))
-            last_slab = dr.select(exists, mi.Int(cells.slab(highest.x + MARGIN, exists)), -1)
-            cell, last_cell = cell_range(slab, lowest.y, highest.y, exists)
-            return quad, slab, last_slab, cell, last_cell, lowest.y, highest.y, shapes, active
+            lowest, highest = reduce(dr.minimum, lower).x, reduce(dr.maximum, upper).x
+            last_slab = mi.Int(cells.slab(highest + MARGIN, exists))
+            last_slab = dr.select(exists, last_slab, -1)
+            spans_between = [blocks.span(shape) for shape in shapes]
 
-        def body(*state):
-            state = dr.if_stmt(
-                state,
-                state[-1] & (state[1] > state[2]),
-                next_quad,
-                lambda *state: state,
-                label="next quad",
-            )
-            quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active = state
-            inside = active & (slab <= last_slab)
-            s, c = mi.UInt32(slab), mi.UInt32(cell)
-            x = [dr.gather(mi.Float, self.slab_edges, s + k, inside) for k in range(2)]
-            index = s * (cells.count + 1) + c
-            y = [dr.gather(mi.Float, self.cell_edges, index + k, inside) for k in range(2)]
-            centre = mi.Vector2f(0.5 * (x[0] + x[1]), 0.5 * (y[0] + y[1]))
-            half = mi.Vector2f(0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])) + MARGIN
-            met = reduce(or_, (blocks.meets(shape, centre, half) for shape in shapes))
-            found = inside & met
-            slot = dr.scatter_inc(counters, counter_of_cell(s * cells.count + c), found)
-            if entries is not None:
-                dr.scatter(entries, blocks.entry(block_row, block_column, quad), slot, found)
+            def each_slab(slab):
+                s = mi.UInt32(slab)
+                left, right = (dr.gather(mi.Float, self.slab_edges, s + k) for k in (0, 1))
+                spans = [span(left - MARGIN, right + MARGIN) for span in spans_between]
+                low, high = zip(*spans, strict=True)
+                lowest, highest = reduce(dr.minimum, low), reduce(dr.maximum, high)
+                last_cell = mi.Int(cells.cell_in_slab(s, highest + MARGIN))
+                last_cell = dr.select(lowest <= highest, last_cell, -1)
 
-            cell = cell + 1
-            next_slab = inside & (cell > last_cell)
-            slab = dr.select(next_slab, slab + 1, slab)
-            first_cell, final_cell = cell_range(slab, lower, upper, next_slab & (slab <= last_slab))
-            cell = dr.select(next_slab, first_cell, cell)
-            last_cell = dr.select(next_slab, final_cell, last_cell)
-            return quad, slab, last_slab, cell, last_cell, lower, upper, shapes, active
+                def each_cell(cell):
+                    c = mi.UInt32(cell)
+                    edge = s * (cells.count + 1) + c
+                    bottom, top = (dr.gather(mi.Float, self.cell_edges, edge + k) for k in (0, 1))
+                    met = reduce(
+                        or_,
+                        ((y <= top + MARGIN) & (z >= bottom - MARGIN) for y, z in spans),
+                    )
+                    place = counter_of_cell(s * cells.count + c)
+                    if entries is None:  # no two lanes meet at a counter
+                        dr.scatter_add(
+                            counters, mi.UInt32(1), place, met, dr.ReduceMode.NoConflicts
+                        )
+                    else:
+                        slot = dr.scatter_inc(counters, place, met)
+                        entry = blocks.entry(block_row, block_column, quad)
+                        dr.scatter(entries, entry, slot, met)
+                    return (cell + 1,)
 
-        n = dr.width(block_row)
-        none, zero = dr.zeros(mi.Int, n), dr.zeros(mi.Float, n)
-        shapes = tuple(
-            tuple(dr.zeros(mi.Vector2f, n) for _ in range(3)) for _ in range(blocks.shapes_each)
-        )
-        state = (
-            dr.full(mi.UInt32, 0xFFFFFFFF, n),
-            none + 0,
-            none - 1,
-            none + 0,
-            none - 1,
-            zero + 0,
-            zero + 0,
-            shapes,
-            dr.full(mi.Bool, True, n),
-        )
-        dr.while_loop(state, lambda *state: state[-1], body, label="scan of quads")
+                first_cell = mi.Int(cells.cell_in_slab(s, lowest - MARGIN))
+                loop(first_cell, lambda cell: cell <= last_cell, each_cell, "cells of a quad")
+                return (slab + 1,)
+
+            first_slab = mi.Int(cells.slab(lowest - MARGIN, exists))
+            loop(first_slab, lambda slab: slab <= last_slab, each_slab, "slabs of a quad")
+            return (quad + 1,)
+
+        quad = dr.zeros(mi.UInt32, dr.width(block_row))
+        loop(quad, lambda quad: quad < count, each_quad, "scan of quads")
         dr.eval(counters, entries)

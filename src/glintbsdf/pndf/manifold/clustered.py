@@ -396,12 +396,13 @@ class Ladder:
             np.maximum(normals.max(0), clusters.max((0, 1))) + reach,
         )
         triangles = triangles_of(clusters)
+        points = stored(mi.Float, normals.astype(np.float32).ravel())
         entries = elements = slabs = 0
         rungs = []
         for _, cut, shift in cuts:
             blocks = BlocksOfElements(cut, rows, columns, shift, triangles)
             allowed = BYTES_PER_ELEMENT << (shift - SHIFT - FIRST_RUNG)
-            lists = Builder(blocks, normals, bounds, allowed).arrays()
+            lists = Builder(blocks, points, bounds, allowed).arrays()
             lists["start"] += np.uint32(entries)
             lists["slab_of_x"] = lists["slab_of_x"].astype(np.uint32) + slabs
             lists["first_of_row"] = blocks.first[: -1 : blocks.columns] + elements
@@ -441,7 +442,8 @@ class BlocksOfElements(Blocks):
         self.elements = np.stack([column | level << COLUMN_BITS, row], 1).astype(np.uint32)
         self.rows, self.columns = -(-rows >> shift), -(-columns >> shift)
         self.mean_count = len(column) / (self.rows * self.columns)
-        self.largest_entry = np.diff(self.first[:: self.columns]).max()
+        self.longest_list = int(np.diff(self.first[:: self.columns]).max())
+        self.largest_entry = self.longest_list - 1
         self.triangles_of_element = triangles
         self.device_first = stored(mi.UInt32, self.first.astype(np.uint32))
         self.device_elements = stored(mi.UInt32, self.elements.ravel())

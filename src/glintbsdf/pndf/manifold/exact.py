@@ -90,7 +90,7 @@ class Manifold(TexelMesh, PNDF):
             return QuadLists.build(
                 self.lattice,
                 self.effective_triangles,
-                self.data.numpy().reshape(-1, 2),
+                self.data.array,
                 self.normal_bounds(),
                 window,
             )
@@ -110,9 +110,12 @@ class Manifold(TexelMesh, PNDF):
 
     def normal_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest rectangle (lower, upper) of projected normals that holds all triangles."""
-        normals = self.data.numpy().reshape(-1, 2)
+        normals = dr.unravel(mi.Vector2f, dr.detach(self.data.array))
         reach = equilateral(self.epsilon)[0][1] * 1.001
-        return normals.min(0) - reach, normals.max(0) + reach
+        lower, upper = (
+            np.array([extreme(x)[0] for x in normals], np.float32) for extreme in (dr.min, dr.max)
+        )
+        return lower - np.float32(reach), upper + np.float32(reach)
 
     def eval(
         self, m: mi.Vector2f, query: Query | Footprint, active: bool | mi.Bool = True
