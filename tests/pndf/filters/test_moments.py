@@ -60,8 +60,7 @@ def test_exact_at_the_samples_of_a_level(variant, name, wrap_mode):
     chain = pyramid(normal_map)
     periodic = wrap_mode != "clamp"
     for level in (1, 3, 5):
-        sigma = moments.level_sigma(level)
-        spacing = 2.0 ** max(0, np.floor(np.log2(sigma * moments.SPACING)))
+        sigma, spacing = moments.FINE.sigma_of(level), moments.FINE.spacing_of(level)
         period = 2 if wrap_mode == "mirror" else 1
         place = []
         for n in (normal_map.width, normal_map.height):

@@ -44,7 +44,7 @@ from glintbsdf.microfacet.mean_plane import (
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.elements.levels import Levels
 from glintbsdf.pndf.filters.filters import COVARIANCE
-from glintbsdf.pndf.filters.moments import MomentPyramid, level_sigma
+from glintbsdf.pndf.filters.moments import COARSE, MomentPyramid
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap, lattice_mass
 from glintbsdf.pndf.index.ellipses import BlocksOfEllipses
 from glintbsdf.pndf.index.lists import Builder, QuadLists, every_quad
@@ -72,10 +72,6 @@ LISTS_SPREAD = 1.6
 #: Memory allowed to the lists, in bytes per cell: with one seed per cell, and with several. The
 #: whole structure then takes less memory than the paper reports.
 BYTES_PER_CELL = 42, 96
-
-#: Finest level of the pyramid of slope moments. It then takes a tenth of the memory of the lists.
-#: Narrower footprints are integrated by points of the map.
-FIRST_LEVEL = 7
 
 #: Largest number of attempts of the rejection sampler. On a lattice nine in ten succeed, in a gap
 #: between flakes a few in a hundred.
@@ -594,7 +590,8 @@ class Elements(Mixture):
                 self.wrap_mode,
                 lambda m: list(slope_of(m)),
                 spread=COVARIANCE,
-                first=FIRST_LEVEL,
+                first=1,
+                scale=COARSE,
                 domain=self.domain,
             )
 
@@ -608,7 +605,7 @@ class Elements(Mixture):
         """As the base class; by points of the map where the pyramid of moments is too coarse."""
         height, width, _ = self.data.shape
         kernel = query.texel_kernel("gaussian", height, width, self.wrap_mode)
-        narrow = kernel.minor_variance < level_sigma(FIRST_LEVEL) ** 2
+        narrow = kernel.minor_variance < COARSE.narrowest(1) ** 2
         points = mean_over_points(
             self, kernel, directions, active & narrow, False, dr.square(self.sigma_r)
         )

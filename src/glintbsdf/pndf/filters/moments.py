@@ -4,13 +4,13 @@ A filter of normal maps averages a few moments of the normals over the footprint
 of the averages. This module averages, whatever the moments are.
 
 The footprint is a Gaussian, and so are the levels of the chain. Level 0 holds the texels. Level
-ℓ ≥ 1 holds averages over an isotropic Gaussian of standard deviation :func:`level_sigma` (ℓ). They
-are averages of the continuous map, which has triangles between texel centres. The averages are
-exact for a footprint that equals a level's Gaussian around one of its samples. Any other round
-footprint is a mixture of two levels that has the footprint's variance. A stretched footprint is a
-sum of such lookups along its major axis, as in texture hardware (Heckbert, "Fundamentals of Texture
-Mapping and Image Warping", 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic
-Texture Mapping", SIGGRAPH 1999).
+ℓ ≥ 1 holds averages over an isotropic Gaussian, see :class:`Scale`. They are averages of the
+continuous map, which has triangles between texel centres. The averages are exact for a footprint
+that equals a level's Gaussian around one of its samples. Any other round footprint is a mixture of
+two levels that has the footprint's variance. A stretched footprint is a sum of such lookups along
+its major axis, as in texture hardware (Heckbert, "Fundamentals of Texture Mapping and Image
+Warping", 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping",
+SIGGRAPH 1999).
 
 ``python -m benchmarks accuracy moments`` measures the accuracy. Footprints narrower than a texel
 mix in the texels themselves. Their mean squares exceed those of the interpolated normals, so these
@@ -29,9 +29,9 @@ from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.core.memory import NOTABLE
 from glintbsdf.core.opaque import joined, opaque
 from glintbsdf.core.progress import progress
 from glintbsdf.footprint.domain import Domain
@@ -39,13 +39,11 @@ from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
+from glintbsdf.pndf.filters.records import FloatRecords, PackedRecords
 
-#: Ratio of the standard deviations of two successive levels.
-RATIO = 2 ** (1 / 3)
-
-#: Largest spacing of a level's samples, in standard deviations of the level. It is never less than
-#: a texel.
-SPACING = 0.8
+#: Samples of the map from which a strip of the finest levels is made. It bounds the memory that the
+#: build needs besides its result.
+STRIP = 1 << 20
 
 #: Samples of a level beyond each border of a map that is not periodic. Farther out, the averages
 #: are constant.
@@ -74,18 +72,52 @@ SIGMA_LOOKUP = 0.5
 TINY = 1e-12
 
 
-def level_sigma(level: int) -> float:
-    """Standard deviation of the Gaussian of a level ≥ 1, texels."""
-    return RATIO ** (level - 1)
+class Scale(NamedTuple):
+    """The Gaussians of the levels ≥ 1 of a chain.
 
-
-def level_below(variance):
-    """The coarsest level that is fine enough for a lookup of this variance (texels²).
-
-    A level counts with its variance and half of the largest variance that interpolation adds. The
-    result is < 0 for variances below level 0.
+    Attributes:
+        sigma (float): standard deviation of level 1, texels.
+        ratio (float): ratio of the standard deviations of two successive levels.
+        spacing (float): largest spacing of a level's samples, in standard deviations of the level.
+            It is never less than a texel.
     """
-    return dr.floor(dr.log2(variance * (1 / (1 + SPACING**2 / 8))) / (2 * log2(RATIO))) + 1
+
+    sigma: float
+    ratio: float
+    spacing: float
+
+    def sigma_of(self, level: int) -> float:
+        """Standard deviation of a level ≥ 1, texels."""
+        return self.sigma * self.ratio ** (level - 1)
+
+    def spacing_of(self, level: int) -> float:
+        """Largest spacing of a level's samples, texels."""
+        return 2.0 ** max(0, floor(log2(self.sigma_of(level) * self.spacing) + 1e-6))
+
+    def variance_of(self, level):
+        """Variance of a level (``mi.Float``), texels²."""
+        variance = dr.exp2(2 * log2(self.ratio) * (level - 1)) * self.sigma**2
+        return dr.select(level > 0, variance, 0)
+
+    def level_below(self, variance):
+        """The coarsest level that is fine enough for a lookup of this variance (texels²).
+
+        A level counts with its variance and half of the largest variance that interpolation adds.
+        The result is < 1 for variances below those of level 1, or of the texels.
+        """
+        relative = variance * (1 / (self.sigma**2 * (1 + self.spacing**2 / 8)))
+        return dr.floor(dr.log2(relative) / (2 * log2(self.ratio))) + 1
+
+    def narrowest(self, level: int) -> float:
+        """Standard deviation of the narrowest footprint for which a level is fine enough."""
+        return self.sigma_of(level) * sqrt(1 + self.spacing**2 / 8)
+
+
+#: Three levels per octave, for lobes that are made of the averages.
+FINE = Scale(1.0, 2 ** (1 / 3), 0.8)
+
+#: One level per octave, and none as fine as the map. Such a chain has a sixteenth of the memory.
+COARSE = Scale(1.6, 2.0, 1.25)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -171,6 +203,23 @@ class SampleAxis:
             return mi.UInt32(index - turns * self.samples)
         return mi.UInt32(dr.clip(index, 0, self.samples - 1))
 
+    def part(self, rows: range) -> SampleAxis:
+        """Some of the samples, which may lie outside of the first period, as an axis of their
+        own."""
+        if rows == range(self.count):
+            return self
+        origin = self.origin + self.spacing * rows.start
+        return SampleAxis(len(rows), origin, self.spacing, False)
+
+    def reached(self, target: SampleAxis, rows: range, reach: float) -> range:
+        """The samples within ``reach`` (texels) of some ``rows`` of another axis."""
+        first, last = (target.origin + target.spacing * k for k in (rows.start, rows.stop - 1))
+        low = floor((first - reach - self.origin) / self.spacing) - 1
+        high = ceil((last + reach - self.origin) / self.spacing) + 2
+        if self.periodic:
+            return range(low, high)
+        return range(max(low, 0), min(high, self.count))
+
 
 def level_axis(texels: int, spacing: float, periodic: bool) -> SampleAxis:
     """The samples of a level along an axis of ``texels``; ``spacing`` is the largest allowed."""
@@ -232,33 +281,35 @@ def smooth(
     return central(origin, [total / weights for total in totals], spread)
 
 
-def all_texels(normals, texels: tuple[SampleAxis, SampleAxis], axes: tuple[SampleAxis, SampleAxis]):
-    """The normals (``mi.Vector2f``) at the samples of ``axes``, which are texels."""
-    index = dr.arange(mi.UInt32, axes[0].count * axes[1].count)
-    row, column = (
-        mi.Int(i) + int(axis.origin) for i, axis in zip(axes[1].divided(index), axes, strict=True)
-    )
-    index = texels[0].wrapped(row) * mi.UInt32(texels[1].samples) + texels[1].wrapped(column)
-    return dr.gather(mi.Vector2f, normals, index)
+def texel_normals(normals, axes: tuple[SampleAxis, SampleAxis], rows: range):
+    """The normals (``mi.Vector2f``) of some rows of texels."""
+    row, column = axes[1].divided(dr.arange(mi.UInt32, len(rows) * axes[1].count))
+    row = axes[0].wrapped(mi.Int(row) + opaque(mi.Int, rows.start))
+    return dr.gather(mi.Vector2f, normals, row * mi.UInt32(axes[1].samples) + column)
 
 
-def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAxis]):
-    """Averages over each quad between four texels, and the axes of the quads' centres.
-
-    ``over_quad`` computes them from the normals at the corners.
-    """
-    # Where the map is not periodic there is a constant quad beyond each border.
-    quads = tuple(
+def quad_axes(axes: tuple[SampleAxis, SampleAxis]) -> tuple[SampleAxis, SampleAxis]:
+    """The axes of the centres of the quads between four texels. Where the map is not periodic there
+    is a constant quad beyond each border."""
+    return tuple(
         SampleAxis(axis.count, 0.5, 1.0, True)
         if axis.periodic
         else SampleAxis(axis.count + 1, -0.5, 1.0, False)
         for axis in axes
     )
-    index = dr.arange(mi.UInt32, quads[0].count * quads[1].count)
-    row, column = (
-        mi.Int(i) if axis.periodic else mi.Int(i) - 1
-        for i, axis in zip(quads[1].divided(index), axes, strict=True)
-    )
+
+
+def quad_averages(
+    over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAxis], rows: range
+) -> list:
+    """Averages over each quad of some ``rows`` of quads between four texels.
+
+    ``over_quad`` computes them from the normals at the corners.
+    """
+    columns = quad_axes(axes)[1]
+    row, column = columns.divided(dr.arange(mi.UInt32, len(rows) * columns.count))
+    shift = 0 if columns.periodic else 1
+    row, column = mi.Int(row) + opaque(mi.Int, rows.start - shift), mi.Int(column) - shift
     corners = [
         dr.gather(
             mi.Vector2f,
@@ -268,7 +319,7 @@ def quad_averages(over_quad: Callable, normals, axes: tuple[SampleAxis, SampleAx
         for i in (0, 1)
         for j in (0, 1)
     ]
-    return over_quad(corners), quads
+    return over_quad(corners)
 
 
 def record_of(moments: Callable, spread: Spread, normal) -> list:
@@ -312,18 +363,11 @@ def samples(window) -> int:
     return rows * columns
 
 
-def cut_out(level: list, axes: tuple[SampleAxis, SampleAxis], window) -> list:
-    """The part of a level in a window, which may cross the border."""
-    (top, rows), (left, columns) = window
-    if window == tuple((0, axis.count) for axis in axes):
-        return level
-    index = dr.arange(mi.UInt32, rows * columns)
-    columns = opaque(mi.UInt32, columns)
-    row = index // columns
-    column = axes[1].wrapped(opaque(mi.Int, left) + mi.Int(index - row * columns))
-    row = axes[0].wrapped(opaque(mi.Int, top) + mi.Int(row))
-    index = row * mi.UInt32(axes[1].samples) + column
-    return [dr.gather(mi.Float, channel, index) for channel in level]
+class Strip(NamedTuple):
+    """The ``rows`` of a level that a step of the build has, and those among them that it stores."""
+
+    rows: range
+    own: range
 
 
 class LevelSamples(NamedTuple):
@@ -396,14 +440,13 @@ class MomentPyramid:
             which are central second moments, follow the averages of ``moments`` in all records.
         between (bool): whether central second moments include the differences of means between
             samples of the chain, and between lookups.
-        finish: function of the averages of a sample that returns the values to store and to
-            interpolate; by default the averages themselves.
         max_anisotropy (float): largest ratio of the footprint's axes, ≥ 1. A longer footprint is
             widened across.
         over_quad: function of the normals at the corners of a quad that returns the averages over
             the quad; by default :func:`midpoint_rule` of ``moments``.
         first (int): the finest level; by default 0, or 1 without ``moments``. A narrower footprint
             is widened.
+        scale (Scale): the Gaussians of the levels.
         records: for a map that repeats, the values of each texel to average in place of
             ``over_quad``: one ``mi.Float`` of H·W numbers per channel.
         domain (Domain): the queries to expect. Levels and parts of levels that none of them needs
@@ -419,7 +462,6 @@ class MomentPyramid:
         data: mi.TensorXf,
         wrap_mode: str,
         moments: Callable | None,
-        finish: Callable = lambda averages: averages,
         max_anisotropy: float = 16.0,
         over_quad: Callable | None = None,
         domain: Domain | None = None,
@@ -427,8 +469,9 @@ class MomentPyramid:
         between: bool = True,
         first: int | None = None,
         records: list | None = None,
+        scale: Scale = FINE,
     ) -> None:
-        self.spread = spread if between else ()
+        self.spread, self.scale = spread if between else (), scale
         self.height, self.width, _ = data.shape
         self.wrap_mode, self.max_anisotropy = wrap_mode, max_anisotropy
         self.periodic = wrap_mode != "clamp"
@@ -439,68 +482,163 @@ class MomentPyramid:
         )
         self.first = (0 if moments is not None else 1) if first is None else first
         self.top = self.first + 1
-        while max(rows, columns) > level_sigma(self.top):
+        while max(rows, columns) > scale.sigma_of(self.top):
             self.top += 1
         if domain is not None:  # with a margin for rounding
             last = self.top - 1
-            self.first = int(dr.clip(level_below(0.998 * domain.smallest**2), self.first, last))
-            last = int(dr.clip(level_below(1.002 * domain.largest**2), self.first, last))
+            fit = scale.level_below
+            self.first = int(dr.clip(fit(0.998 * domain.smallest**2), self.first, last))
+            last = int(dr.clip(fit(1.002 * domain.largest**2), self.first, last))
             self.top = last + 1
 
-        def axes_of(number: int) -> tuple[SampleAxis, SampleAxis]:
-            spacing = 2.0 ** max(0, floor(log2(level_sigma(number) * SPACING)))
-            return tuple(level_axis(n, spacing, self.periodic) for n in (rows, columns))
+        self.texels, self.normals = texels, normals
+        self.shapes = {0: texels} | {
+            number: tuple(
+                level_axis(n, scale.spacing_of(number), self.periodic) for n in (rows, columns)
+            )
+            for number in range(1, self.top + 1)
+        }
+        self.windows = self.choose_windows(domain)
+        over_quad = over_quad or partial(midpoint_rule, moments, spread)
+        self.build(moments, over_quad, records, spread)
+        del self.normals
 
-        shapes = [axes_of(number) for number in range(self.first, self.top + 1)]
-        windows = self.choose_windows(shapes, domain)
-        stored: list[list[mi.Float]] = []
+    def build(
+        self,
+        moments: Callable | None,
+        over_quad: Callable,
+        records: list | None,
+        spread: Spread,
+    ) -> None:
+        """Average the map, level by level, and store the levels.
 
-        def keep(level: list) -> None:
-            k = len(stored)
-            stored.append(list(finish(cut_out(level, shapes[k], windows[k]))))
+        The levels as fine as the map, and the first one that is coarser, are made in strips: no
+        such level exists as a whole in floats.
+        """
+        self.channels = len(records or over_quad([mi.Vector2f(0)] * 4))
+        numbers = range(self.first, self.top + 1)
+        sizes = [samples(self.windows[number]) for number in numbers]
+        ends = np.cumsum([0, *sizes]).tolist()
+        self.begin = dict(zip(numbers, ends[:-1], strict=True))
+        if spread and not dr.grad_enabled(self.normals):
+            means = self.channels - len(spread)
+            self.records = PackedRecords(ends[-1], means, len(spread))
+        else:
+            self.records = FloatRecords(ends[-1], self.channels)
+        self.nbytes = self.records.nbytes
 
-        if self.first == 0:
-            keep(record_of(moments, spread, all_texels(normals, texels, axes_of(0))))
-        level, axes = records, texels
+        coarse = next((n for n in range(1, self.top) if self.scale.spacing_of(n) > 1), self.top)
+        base = self.texels if records else quad_axes(self.texels)
+        strips = 1
         if records is None:
-            over_quad = over_quad or partial(midpoint_rule, moments, spread)
-            level, axes = quad_averages(over_quad, normals, texels)
-        variance = 1 / 12  # of a quad or a texel, along each axis
-        nbytes = 4 * len(level) * sum(map(samples, windows))
-        with progress("Averaging the map", nbytes) as report:
-            for number in range(1, self.top + 1):
-                sigma, target = level_sigma(number), axes_of(number)
-                for along in (0, 1):
-                    level = smooth(level, axes, along, target[along], sigma**2 - variance, spread)
-                    axes = (target[0], axes[1]) if along == 0 else target
-                    dr.eval(level)
-                variance = sigma**2
-                if number >= self.first:
-                    keep(level)
-                if nbytes >= NOTABLE:
-                    dr.sync_thread()
-                    report(number / self.top)
-            self.store(stored, shapes, windows)
+            strips = min(base[0].count * base[1].count // STRIP, self.shapes[coarse][0].count // 8)
+        strips = max(strips, 1)
+        with progress("Averaging the map", self.nbytes) as report:
+            parts = []
+            for k in range(strips):
+                plan = self.plan(base[0], coarse, k, strips)
+                if self.first == 0:
+                    rows = plan[0].own
+                    texels = texel_normals(self.normals, self.texels, rows)
+                    self.keep(0, record_of(moments, spread, texels), Strip(rows, rows))
+                level, axes = records, base
+                if records is None:
+                    level = quad_averages(over_quad, self.normals, self.texels, plan[0].rows)
+                    axes = base[0].part(plan[0].rows), base[1]
+                for number in range(1, coarse + 1):
+                    level, axes = self.next_level(level, axes, number, plan[number].rows, spread)
+                    self.keep(number, level, plan[number])
+                parts.append(level)
+                report(0.8 * (k + 1) / strips)
+            level = joined(parts) if strips > 1 else parts[0]
+            parts.clear()
+            axes = self.shapes[coarse]
+            for number in range(coarse + 1, self.top + 1):
+                rows = range(self.shapes[number][0].count)
+                level, axes = self.next_level(level, axes, number, rows, spread)
+                self.keep(number, level, Strip(rows, rows))
+        dr.flush_malloc_cache()
+        self.index_levels()
 
-    def choose_windows(
-        self, shapes: list[tuple[SampleAxis, SampleAxis]], domain: Domain | None
-    ) -> list:
+    def plan(self, base: SampleAxis, coarse: int, k: int, strips: int) -> list[Strip]:
+        """The rows of strip ``k`` of the base of the chain, and of its levels up to ``coarse``."""
+
+        def own(axis: SampleAxis) -> range:
+            return range(axis.count * k // strips, axis.count * (k + 1) // strips)
+
+        axes = [base] + [self.shapes[number][0] for number in range(1, coarse + 1)]
+        plan = [Strip(own(axes[-1]), own(axes[-1]))]
+        for number in range(coarse, 0, -1):
+            mine = own(self.texels[0] if number == 1 else axes[number - 1])
+            rows = range(axes[number - 1].count)
+            if strips > 1:
+                reach = CUT * sqrt(self.added_variance(number))
+                rows = axes[number - 1].reached(axes[number], plan[0].rows, reach)
+                if number > 1:
+                    rows = range(min(rows.start, mine.start), max(rows.stop, mine.stop))
+            plan.insert(0, Strip(rows, mine))
+        return plan
+
+    def added_variance(self, number: int) -> float:
+        """Variance (texels²) of the Gaussian that makes a level from the one below, or from quads
+        or texels, along each axis."""
+        below = self.scale.sigma_of(number - 1) ** 2 if number > 1 else 1 / 12
+        return self.scale.sigma_of(number) ** 2 - below
+
+    def next_level(self, level: list, axes, number: int, rows: range, spread: Spread) -> tuple:
+        """Some rows of a level, from those of the level below, and their axes."""
+        target = self.shapes[number][0].part(rows), self.shapes[number][1]
+        for along in (0, 1):
+            variance = self.added_variance(number)
+            level = smooth(level, axes, along, target[along], variance, spread)
+            axes = (target[0], axes[1]) if along == 0 else target
+            dr.eval(level)
+        return level, axes
+
+    def keep(self, number: int, level: list, strip: Strip) -> None:
+        """Store the part of a strip of a level that is the strip's own and in the window."""
+        if number < self.first:
+            return
+        rows, columns = self.shapes[number]
+        (top, height), (left, width) = self.windows[number]
+        turns = range(top // rows.count, -(-(top + height) // rows.count))
+        for turn in turns if rows.periodic else (0,):
+            shift = turn * rows.count
+            first = max(top, strip.own.start + shift)
+            last = min(top + height, strip.own.stop + shift)
+            if first >= last:
+                continue
+            index = dr.arange(mi.UInt32, (last - first) * width)
+            begin = opaque(mi.UInt32, self.begin[number] + (first - top) * width)
+            # The levels of a small map are stored as they are.
+            found = level
+            if (strip.rows, left, width) != (range(first, last), 0, columns.count):
+                pitch = opaque(mi.UInt32, width)
+                row = index // pitch
+                column = columns.wrapped(opaque(mi.Int, left) + mi.Int(index - row * pitch))
+                row = row + opaque(mi.UInt32, first - shift - strip.rows.start)
+                source = row * mi.UInt32(columns.samples) + column
+                found = [dr.gather(mi.Float, channel, source) for channel in level]
+            self.records.put(begin + index, found)
+
+    def choose_windows(self, domain: Domain | None) -> dict:
         """The part of each level to store: ``(first, number)`` of its rows, and of its columns.
 
         These are the whole levels, or their parts within the domain if these are smaller. A part
         may cross the border of a periodic level. It is stored in one piece, so that lookups need
         not wrap.
         """
-        whole = [tuple((0, axis.count) for axis in axes) for axes in shapes]
+        kept = {number: self.shapes[number] for number in range(self.first, self.top + 1)}
+        whole = {n: tuple((0, axis.count) for axis in axes) for n, axes in kept.items()}
         self.wraps = self.periodic
         if domain is None:
             return whole
         ends = domain.rows, domain.columns
-        parts = [
-            tuple(samples_within(axis, *end) for axis, end in zip(axes, ends, strict=True))
-            for axes in shapes
-        ]
-        if sum(map(samples, parts)) >= sum(map(samples, whole)):
+        parts = {
+            n: tuple(samples_within(axis, *end) for axis, end in zip(axes, ends, strict=True))
+            for n, axes in kept.items()
+        }
+        if sum(map(samples, parts.values())) >= sum(map(samples, whole.values())):
             return whole
         self.wraps = False
         return parts
@@ -518,32 +656,17 @@ class MomentPyramid:
         mirrored = dr.gather(mi.Vector2f, data.array, row * width + column)
         return dr.ravel(mirrored), 2 * self.height, 2 * self.width
 
-    def store(
-        self, levels: list[list], shapes: list[tuple[SampleAxis, SampleAxis]], windows: list
-    ) -> None:
-        """Store the levels one after the other, in arrays of four channels, and one of a single
-        channel where one is left.
-
-        ``windows``: the part of each level, see :meth:`choose_windows`.
-        """
-        channels = joined(levels)
-        for level in levels:  # a large map then never has three copies
-            level.clear()
-        self.channels = len(channels)
-        zero = dr.zeros(mi.Float, dr.width(channels[0]))
-        self.records = []
-        while len(channels) > 1:
-            group, channels = channels[:4], channels[4:]
-            group = group + [zero] * (4 - len(group))
-            self.records.append(dr.ravel(mi.Vector4f(group)))
-        self.single = channels[0] if channels else None
-        sizes = [samples(window) for window in windows]
-        pitches = [columns for _, (_, columns) in windows]
+    def index_levels(self) -> None:
+        """Tell where the levels are stored, and where their samples stand."""
         # Index of the first sample of the whole level. It may be negative: indices are modulo 2³².
-        offsets = [
-            (sum(sizes[:k]) - top * columns - left) % 2**32
-            for k, ((top, _), (left, columns)) in enumerate(windows)
-        ]
+        offsets, pitches = zip(
+            *(
+                ((self.begin[n] - top * columns - left) % 2**32, columns)
+                for n, ((top, _), (left, columns)) in self.windows.items()
+            ),
+            strict=True,
+        )
+        shapes = [self.shapes[n] for n in self.windows]
         self.layout = dr.ravel(mi.Vector2u(mi.UInt32(offsets), mi.UInt32(pitches)))
         # index = (position + 1/2) / spacing − 1/2 (+ border), for every level; see level_axis.
         self.grids = dr.ravel(
@@ -556,8 +679,7 @@ class MomentPyramid:
                 ]
             )
         )
-        dr.eval(self.records, self.single, self.layout, self.grids)
-        self.nbytes = 4 * sum(sizes) * (4 * len(self.records) + (self.single is not None))
+        dr.eval(self.layout, self.grids)
 
     # --------------------------------------------------------------------------------------------
     #  Lookup
@@ -574,7 +696,8 @@ class MomentPyramid:
         variance = dr.maximum(variance_minor, variance_major / self.max_anisotropy**2)
         variance, step, steps, sharpness = taps(variance_major, variance)
         last = opaque(mi.Float, self.top - 1)
-        level = dr.clip(level_below(variance), opaque(mi.Float, self.first), last)
+        level = self.scale.level_below(variance)
+        level = dr.clip(level, opaque(mi.Float, self.first), last)
         grids = [self.grid(level), self.grid(level + 1)]
         steps = dr.select(active, steps, -1)  # the loop runs from −steps to steps: it does not run
         step = major * step
@@ -595,7 +718,6 @@ class MomentPyramid:
         """Layout of the samples of a level (``mi.Float``)."""
         index = mi.UInt32(level - opaque(mi.Float, self.first))
         scale_x, scale_y, columns, rows = dr.gather(mi.Vector4f, self.grids, index)
-        variance = dr.select(level > 0, dr.exp2((2 * log2(RATIO)) * (level - 1)), 0)
         offset, pitch = dr.gather(mi.Vector2u, self.layout, index)
         return LevelSamples(
             offset,
@@ -603,7 +725,7 @@ class MomentPyramid:
             mi.Vector2f(scale_x, scale_y),
             mi.Vector2f(columns, rows),
             mi.Vector2f(dr.rcp(columns), dr.rcp(rows)),
-            variance,
+            self.scale.variance_of(level),
             mi.Vector2f(0.5 * dr.rcp(dr.square(scale_x)), 0.5 * dr.rcp(dr.square(scale_y))),
         )
 
@@ -630,20 +752,13 @@ class MomentPyramid:
             first, second = (dr.clip(corner + k, 0, count - 1) for k in (0, 1))
         return mi.Vector2u(first), mi.Vector2u(second), place - corner
 
-    def record(self, index) -> list:
-        """The values of the sample at an index."""
-        values = [x for records in self.records for x in dr.gather(mi.Vector4f, records, index)]
-        if self.single is not None:
-            values.append(dr.gather(mi.Float, self.single, index))
-        return values[: self.channels]
-
     def nearest_means(self, position, grid: LevelSamples) -> list:
         """The means of the sample nearest to a position (texels), as an origin for the averages."""
         if not self.spread:
             return []
         first, second, f = self.corners(position, grid)
         x, y = dr.select(f < 0.5, first, second)
-        return origin_of(self.record(grid.offset + y * grid.pitch + x), self.spread)
+        return origin_of(self.records.get(grid.offset + y * grid.pitch + x), self.spread)
 
     def bilinear(self, position, grid: LevelSamples, origin: list):
         """The values of a level at a position (texels), and the variance (texels²) of the kernel
@@ -652,7 +767,7 @@ class MomentPyramid:
         rows = [grid.offset + y * grid.pitch for y in (y0, y1)]
         weight = [wy * wx for wy in (1 - f.y, f.y) for wx in (1 - f.x, f.x)]
         records = [
-            about(origin, self.record(row + x), self.spread) for row in rows for x in (x0, x1)
+            about(origin, self.records.get(row + x), self.spread) for row in rows for x in (x0, x1)
         ]
         averages = [value * weight[0] for value in records[0]]
         for record, w in zip(records[1:], weight[1:], strict=True):
