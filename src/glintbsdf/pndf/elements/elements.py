@@ -71,7 +71,7 @@ LISTS_SPREAD = 1.6
 
 #: Memory allowed to the lists, in bytes per cell: with one seed per cell, and with several. The
 #: whole structure then takes less memory than the paper reports.
-BYTES_PER_CELL = 42, 96
+BYTES_PER_CELL = 42, 64
 
 #: Largest number of attempts of the rejection sampler. On a lattice nine in ten succeed, in a gap
 #: between flakes a few in a hundred.
