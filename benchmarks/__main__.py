@@ -18,6 +18,8 @@ COMMANDS = (
     "stability",
     "accuracy",
     "cost",
+    "front",
+    "gpu",
     "manifold",
     "projected_area",
     "energy",

@@ -1,11 +1,10 @@
-"""Rendering times of every method relative to roughconductor; time and memory of building.
+"""Rendering times of every method relative to roughconductor.
 
 The methods are the ones in ``benchmarks/methods.py`` that are marked for ``cost``.
 """
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from math import radians
 
@@ -86,52 +85,4 @@ def renders(run: Run) -> None:
                     table.measure({"method": method.name, **where}, work)
 
 
-#: Bytes in the papers, by plugin, sides of sample and map, and setting.
-PAPERS = {
-    ("glint_elements", 2048, 2048, "step 0.5"): 1120e6,
-    ("glint_elements", 2048, 2048, "step 1.0"): 280e6,
-    ("glint_mip", 256, 4096, "clusters 32"): 27.4e6,
-    ("glint_mip", 512, 7168, "clusters 32"): 75.8e6,
-}
-
-
-def built(method: Method, sample: NormalMap, size: int) -> dict:
-    """Time and memory of a structure; ``size`` is the side of a map that a sample is made to."""
-    description = method.plugin | {"data": mi.TensorXf(sample.normals)}
-    if method.synthesises:
-        description |= {"output_size": size}
-    start = time.process_time()
-    bsdf, taken = timed(lambda: mi.load_dict(description))
-    setting = (method.plugin["type"], sample.width, size, method.setting)
-    return {
-        "seconds": taken,
-        "cpu_seconds": time.process_time() - start,
-        "megabytes": bsdf.pndf.nbytes / 1e6,
-        "bytes_per_texel": bsdf.pndf.nbytes / sample.width**2,
-        "paper_megabytes": PAPERS[setting] / 1e6 if setting in PAPERS else None,
-    }
-
-
-def building(run: Run) -> None:
-    """Time and memory of the structures of an isotropic map, without the cache.
-
-    ``glint_mip`` makes its map from a sample of 256² or 512² texels; the others get the whole map.
-    Bytes are per texel of the map or sample that a method gets. The papers' figures are shown if
-    there are any: 720 MB of elements and 400 MB of hierarchy for h = ½ (Yan16), and the lobes and
-    look-up table of Table 2 (Tan22).
-    """
-    with run.table("building") as table:
-        for method in METHODS:
-            if not (method.cost and method.mapped) or (run.quick and not method.quick):
-                continue
-            sizes = [(512, 512)] if run.quick else [(2048, 2048)]
-            if method.synthesises:
-                sizes = [(256, 1024)] if run.quick else [(256, 4096), (512, 7168)]
-            for sample, size in sizes:
-                seed = 3 if method.synthesises else 1
-                (make,) = maps_of(Run(), sample, "isotropic", seed=seed).values()
-                key = {"method": method.name, "sample": sample, "size": size}
-                table.measure(key, lambda m=method, make=make, size=size: built(m, make(), size))
-
-
-cost = family("cost", renders, building)
+cost = family("cost", renders)

@@ -1,4 +1,4 @@
-"""glint_grid against the smooth surface that it looks like from afar, and under motion."""
+"""glint_grid under motion."""
 
 from __future__ import annotations
 
@@ -13,93 +13,6 @@ from benchmarks.harness import Run, family
 from glintbsdf import Footprint
 from glintbsdf.pndf import Grid, Particles
 from glintbsdf.pndf.grid.microdetails import CoveredCells
-
-MATERIALS = {
-    "default": {},
-    "anisotropic": {"alpha_u": 0.4, "alpha_v": 0.1, "detail_alpha": 0.04},
-    "grooves": {"detail_alpha_u": 0.3, "detail_alpha_v": 0.03},
-    "grooves along v": {"detail_alpha_u": 0.03, "detail_alpha_v": 0.3},
-    "colour wheel": {"colors": "wheel"},
-    "coloured grooves": {"colors": "wheel", "detail_alpha_u": 0.3},
-    "wide light": {"light_spread": 0.2},
-    "large variation": {"size_variation": 2.0},
-    "equal sizes": {"size_variation": 0.0},
-    "fine details": {"detail_alpha": 0.03},
-}
-
-# --------------------------------------------------------------------------------------------------
-#  Mean and noise
-# --------------------------------------------------------------------------------------------------
-
-
-def smooth(alpha_u: float = 0.3, alpha_v: float = 0.3, **_: object) -> dict:
-    """``roughconductor`` with a Beckmann distribution of the same roughness."""
-    rough = {"type": "roughconductor", "distribution": "beckmann"}
-    return rough | {"alpha_u": alpha_u, "alpha_v": alpha_v}
-
-
-def relative_values(parameters: dict, count: int, extent: float, sigma: float) -> np.ndarray:
-    """Values at random places of [0, extent]², channels × places, relative to the smooth surface.
-
-    ``sigma``: standard deviation of the round footprint, UV.
-    """
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    rng = np.random.default_rng(1)
-    si.uv = mi.Point2f(*(np.float32(x) for x in extent * rng.random((2, count))))
-    si.duv_dx, si.duv_dy = mi.Vector2f(sigma, 0), mi.Vector2f(0, sigma)
-    si.wi = dr.normalize(mi.Vector3f(0.3, 0.1, 1))
-    wo = dr.normalize(mi.Vector3f(0.1, -0.2, 1))
-    bsdf = mi.load_dict({"type": "glint_grid", "footprint_sigma": 1.0, **parameters})
-    value, expected = (
-        np.array(b.eval(mi.BSDFContext(), si, wo), np.float64)
-        for b in (bsdf, mi.load_dict(smooth(**parameters)))
-    )
-    return value / expected
-
-
-def mean(parameters: dict, count: int) -> dict:
-    """Means of red, green and blue, and their standard errors."""
-    # Cells of 3e-3 and 6e-3: over a million even along one axis, as grooves have only one axis.
-    values = relative_values({"density": 5.0, **parameters}, count, 1e4, 3e-3)
-    row = {}
-    for name, channel in zip(("red", "green", "blue"), values, strict=True):
-        row |= {name: float(channel.mean()), f"{name}_error": float(channel.std() / count**0.5)}
-    return row
-
-
-def means(run: Run) -> None:
-    """Mean over 10⁶ places without common cells, relative to ``roughconductor`` (Beckmann).
-
-    Expected: 1, within four standard errors and 0.35 %, which is the error of roughconductor's
-    rational approximation of the masking function.
-    """
-    with run.table("means") as table:
-        for name, parameters in MATERIALS.items():
-            work = partial(mean, parameters, 100_000 if run.quick else 1_000_000)
-            table.measure({"material": name}, work)
-
-
-def deviation(density: int, count: int) -> dict:
-    """Standard deviation over places, relative to the mean; pixels 0.002 wide."""
-    values = relative_values({"density": float(density)}, count, 1.0, 1e-3)
-    return {"deviation": float(values[0].std())}
-
-
-def deviations(run: Run) -> None:
-    """Standard deviation over places, relative to the mean, for densities.
-
-    Expected: it falls with the density; with many microdetails per pixel, by a factor of ten for a
-    hundred times as many.
-    """
-    count = 10_000 if run.quick else 100_000
-    with run.table("deviations") as table:
-        for density in range(2, 15):
-            table.measure({"density": density}, partial(deviation, density, count))
-
-
-# --------------------------------------------------------------------------------------------------
-#  Motion
-# --------------------------------------------------------------------------------------------------
 
 FRAMES, SIZE = 32, 256
 ANGLE = radians(20)  # of the long axis of a pixel
@@ -196,4 +109,4 @@ def motion(run: Run) -> None:
                     table.measure(key, partial(moved, run, *key.values()))
 
 
-grid = family("grid", means, deviations, motion)
+grid = family("grid", motion)

@@ -1,18 +1,15 @@
-"""Lobes of glint_mip against the explicit map (Tan22), and the seams of this map.
+"""Lobes of glint_mip (Tan22): the blend of their levels, and the seams of the map.
 
-The samples have 256² texels, the maps 2048². The reference is ``glint_elements`` with elements half
-a texel apart on the explicit map, as in the paper. Footprints are round and w = 2σ texels wide.
-Errors are relative L1 differences on a grid of 128² normals over the range of the map's normals,
-with σ_r = 0.005, and means over three places. Times are for random queries on one thread.
-
-``cost building`` measures memory and time of building; ``error_vs_time`` measures errors for values
-of C_P, and against the binned P-NDF, with images.
+The samples have 256² texels, the maps 2048². Footprints are round and w = 2σ texels wide.
+Differences are relative L1 differences on a grid of 128² normals over the range of the map's
+normals, with σ_r = 0.005. ``error_vs_time`` measures errors, times and memory for numbers of lobes
+and values of C_P; ``front`` measures building.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -24,23 +21,15 @@ from benchmarks.cases import (
     Ellipse,
     grid_of_normals,
     maps_of,
-    queries,
 )
 from benchmarks.harness import Run, family
-from benchmarks.measures import pndf as errors
 from benchmarks.methods import SIGMA_R
 from glintbsdf import NormalMap
 from glintbsdf.check.stiff import white_noise
 from glintbsdf.maps.quilting import lobe_features, synthesise
-from glintbsdf.pndf import Elements, Mip
+from glintbsdf.pndf import Mip
 
-WIDTHS = (8, 16, 32, 64, 128, 256, 512)
-#: The reference would take minutes for wider footprints.
-WIDEST_REFERENCE = 128
 RES = 128
-
-#: A function that makes structures of a sample, by setting.
-Structures = Callable[[], dict]
 
 
 class NearestLevel(Mip):
@@ -55,14 +44,6 @@ class NearestLevel(Mip):
 def samples_of(run: Run) -> dict[str, Callable[[], NormalMap]]:
     """The samples to make maps from."""
     return maps_of(run, 256, *("isotropic", "scratched")[: 1 if run.quick else 2], seed=3)
-
-
-def structures(make: Callable[[], NormalMap], size: int, settings: dict[str, dict]) -> dict:
-    """The elements of the explicit map, then the lobes for each setting."""
-    shared = {"output_size": size, "sigma_r": SIGMA_R}
-    lobes = {name: Mip(make(), **shared, **options) for name, options in settings.items()}
-    explicit = next(iter(lobes.values())).normal_map
-    return {"elements": Elements(explicit, sigma_r=SIGMA_R, step=0.5)} | lobes
 
 
 def all_normals(normal_map: NormalMap) -> mi.Vector2f:
@@ -80,44 +61,6 @@ def density_at(pndf, uv: tuple, width: float, m: mi.Vector2f) -> np.ndarray:
 def relative_l1(a: np.ndarray, b: np.ndarray) -> float:
     """Relative L1 difference of ``a`` to ``b``."""
     return float(np.abs(a - b).sum() / b.sum())
-
-
-def compared(build: Structures, width: float, repetitions: int) -> list[dict]:
-    """Errors and times of several settings under footprints of one width."""
-    built = build()
-    if width > WIDEST_REFERENCE:
-        built = {name: pndf for name, pndf in built.items() if name != "elements"}
-    first = next(iter(built.values()))
-    m = all_normals(first.normal_map)
-    many = queries(first.normal_map, Ellipse.round(width / 2), 2**13)
-    per_query, ratios = errors.times(list(built.values()), many, repetitions)
-    densities = {
-        name: np.array([density_at(pndf, uv, width, m) for uv in PLACES])
-        for name, pndf in built.items()
-    }
-    exact = densities.get("elements")
-    return [
-        {
-            "setting": name,
-            "relative_l1": None if exact is None else relative_l1(densities[name], exact),
-            "microseconds": 1e6 * float(taken),
-            "faster_than_elements": None if exact is None else ratio,
-            "megabytes": pndf.nbytes / 1e6,
-        }
-        for (name, pndf), taken, ratio in zip(built.items(), per_query, ratios, strict=True)
-    ]
-
-
-def clusters(run: Run) -> None:
-    """Error, time and memory for footprints and numbers k of lobes (Fig. 13)."""
-    settings = {f"k = {k}": {"clusters": k} for k in (16, 32, 64)}
-    size = 1024 if run.quick else 2048
-    with run.table("clusters") as table:
-        for sample, make in samples_of(run).items():
-            build = cache(partial(structures, make, size, settings))
-            for width in WIDTHS[1::2] if run.quick else WIDTHS:
-                work = partial(compared, build, width, run.repetitions)
-                table.measure({"sample": sample, "width": width}, work)
 
 
 def largest_jump(pndf: Mip, widest: float) -> dict:
@@ -215,4 +158,4 @@ def seams(run: Run) -> None:
                 table.measure(key, partial(seam, run, make, **key))
 
 
-mip = family("mip", clusters, interpolation, seams)
+mip = family("mip", interpolation, seams)

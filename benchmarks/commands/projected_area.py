@@ -1,12 +1,10 @@
-"""Projected areas, the masking made of them, and diffuse reflection (Wu24, Fig. 8 and 14)."""
+"""Projected areas and diffuse reflection (Wu24, Fig. 8 and 14)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
-from itertools import product
+from functools import partial
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -14,10 +12,8 @@ from benchmarks.cases import MAPS, maps_of, picture_of, scaled
 from benchmarks.harness import Run, family, rmse, seconds
 from benchmarks.measures.pndf import mean_of
 from glintbsdf import Footprint, NormalMap
-from glintbsdf.footprint.query import Query
-from glintbsdf.microfacet.frame import normal_from_projection
 from glintbsdf.pndf.manifold.mesh import TexelMesh
-from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea, ProjectedAreaMasking
+from glintbsdf.pndf.manifold.projected_area import GgxFit, ProjectedArea
 from glintbsdf.scene.rendering import pixel_spread
 
 # --------------------------------------------------------------------------------------------------
@@ -79,74 +75,6 @@ def areas(run: Run) -> None:
             for sigma in (0.5, 4, 16, 64):
                 work = partial(area_errors, make, sigma, run.quick)
                 table.measure({"map": name, "sigma": sigma}, work)
-
-
-# --------------------------------------------------------------------------------------------------
-#  Furnaces
-# --------------------------------------------------------------------------------------------------
-
-
-def directions_to_the_horizon(rng, count: int) -> np.ndarray:
-    """Unit vectors (3, N): a third is uniform in z, the others are log-uniform down to 1e-4."""
-    z = np.where(rng.random(count) < 0.3, rng.random(count), 10 ** rng.uniform(-4, 0, count))
-    phi, r = 2 * np.pi * rng.random(count), np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z])
-
-
-def furnace(run: Run) -> None:
-    """The share of uniform light that facets reflect, by stratified points of the footprint.
-
-    For the masking by each estimate of P, height-correlated or separable: the largest energy over
-    random places and directions, minus three standard errors, and the share above 1.002. Expected:
-    1; measured: 1.0015, for grooves under a footprint of a hundredth of a texel.
-    """
-    names = ("isotropic", "brushed", "scratched", "leather", "flakes", "rough", "flat")
-    sigmas = (0.01, 0.3, 1, 4) if run.quick else (0.01, 0.1, 0.3, 0.6, 1, 1.4, 2, 4, 8, 16)
-    estimates = {"analytic": ProjectedArea, "ggx_fit": GgxFit}
-    with run.table("furnace") as table:
-        for name, make in maps_of(run, 128, *names[:1] if run.quick else names).items():
-            mesh = cache(lambda make=make: TexelMesh(make()))
-            areas = {e: cache(lambda e=e, mesh=mesh: estimates[e](mesh())) for e in estimates}
-            for sigma, estimate, correlated in product(sigmas, estimates, (True, False)):
-                if estimate == "analytic" and sigma > 4:
-                    continue
-                key = {"map": name, "sigma": sigma, "masking": estimate, "correlated": correlated}
-                table.measure(
-                    key,
-                    lambda mesh=mesh, area=areas[estimate], c=correlated, sigma=sigma: energies(
-                        mesh(), ProjectedAreaMasking(area(), c), sigma, run.quick
-                    ),
-                )
-
-
-def energies(mesh: TexelMesh, masking: ProjectedAreaMasking, sigma: float, quick: bool) -> dict:
-    """Reflected shares of uniform light for random views and places; ``sigma`` is in texels."""
-    count, side = (200, 16) if quick else (1000, 24)
-    sigma /= mesh.normal_map.width
-    rng = np.random.default_rng(4)
-    w, uv = directions_to_the_horizon(rng, count), rng.random((2, count))
-    u = np.mgrid[:count, :side, :side][1:] + rng.random((2, count, side, side))
-    u = np.minimum(np.float32(u / side), np.float32(1 - 2**-24)).reshape(2, -1)
-    wi, uv = (np.float32(v).repeat(side * side, axis=1) for v in (w, uv))
-    wi = mi.Vector3f(wi)
-    footprint = Footprint.isotropic(mi.Point2f(uv), dr.opaque(mi.Float, sigma))
-    kernel = mesh.texel_kernel(footprint)
-    m = normal_from_projection(mesh.normal_at(kernel.mean + kernel.sample(mi.Point2f(u))))
-    facing = dr.dot(wi, m)
-    wo = 2 * facing * m - wi
-    up = (facing > 0) & (wo.z > 0)
-    wo = dr.select(up, wo, mi.Vector3f(0, 0, 1))
-    masked = masking.eval(wi, wo, Query(footprint), mi.TransportMode.Radiance, up)
-    value = facing / (m.z * wi.z) * masked
-    value = np.array(dr.select(up, value, 0), np.float64).reshape(count, -1)
-    energy, error = value.mean(1), value.std(1) / side
-    worst = int(np.argmax(energy - 3 * error))
-    return {
-        "worst": float((energy - 3 * error)[worst]),
-        "at_cosine": float(w[2][worst]),
-        "share": float((energy - 3 * error > 1.002).mean()),
-        "mean": float(energy.mean()),
-    }
 
 
 # --------------------------------------------------------------------------------------------------
@@ -218,4 +146,4 @@ def diffuse(run: Run) -> None:
             table.measure({"repetitions": scale}, work)
 
 
-projected_area = family("projected_area", areas, furnace, diffuse)
+projected_area = family("projected_area", areas, diffuse)
