@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from math import sqrt
 from pathlib import Path
 
+from glintbsdf.core.errors import check
 from glintbsdf.core.messages import warn
 
 #: Memory that is worth telling before it is taken, bytes.
@@ -35,3 +37,28 @@ def warn_if_scarce(work: str, nbytes: float) -> None:
             f"{work} takes about {amount(nbytes)} of memory, and {amount(there)} are free. "
             "A smaller map takes less; glintbsdf render --trim builds what the scene asks for alone"
         )
+
+
+def check_room(owner: str, parameter: str, shape: tuple[int, int], bytes_per_texel: float) -> None:
+    """Refuse a map that takes more memory than is free, before any is taken.
+
+    Args:
+        owner, parameter: names for the message.
+        shape: rows and columns of the map.
+        bytes_per_texel: memory that building takes at most, for each texel.
+
+    Raises:
+        ParameterError: the map does not fit. The message tells what it takes, and what would fit.
+    """
+    there, needed = free(), shape[0] * shape[1] * bytes_per_texel
+    if there is None or needed <= there:
+        return
+    rows, columns = (max(1, int(n * sqrt(there / needed))) for n in shape)
+    check(
+        False,
+        owner,
+        parameter,
+        f"a map of at most {columns} × {rows} texels, as {amount(there)} of memory are free "
+        "(glintbsdf render --trim builds what a scene asks for alone)",
+        f"{shape[1]} × {shape[0]} texels, which take about {amount(needed)}",
+    )

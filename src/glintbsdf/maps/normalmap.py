@@ -122,6 +122,7 @@ class NormalMap:
         )
 
         normals.flags.writeable = False
+        self.parameter = parameter
         self.normals: npt.NDArray[np.float32] = normals
         self.wrap_mode = wrap_mode
         self.notes: tuple[Note, ...] = ()

@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.cache import load_or_build
+from glintbsdf.core.memory import check_room
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.query import Query
@@ -72,6 +73,10 @@ class PNDF(ABC):
     #: Parameters on which the roughness of the whole surface depends.
     roughness_keys: ClassVar[tuple[str, ...]] = ("data", "sigma_r")
 
+    #: Memory that building takes at most, bytes per texel of a map that repeats, besides the map
+    #: (``python -m benchmarks front``). 0 for a P-NDF that takes little.
+    bytes_per_texel: ClassVar[float] = 0.0
+
     owner: str = "PNDF"
     normal_map: NormalMap | None = None
     data: mi.TensorXf
@@ -90,6 +95,15 @@ class PNDF(ABC):
         may build for a larger domain, never for a smaller one. By default there is no structure.
         """
         self.domain = domain
+
+    @classmethod
+    def check_room(cls, normal_map: NormalMap, owner: str, domain: Domain | None) -> None:
+        """Raise :class:`~.ParameterError` where the structures of a map take more memory than is
+        free. A domain makes them smaller than can be told beforehand."""
+        if domain is None:
+            periods = 4 if normal_map.wrap_mode == "mirror" else 1
+            shape = normal_map.height, normal_map.width
+            check_room(owner, normal_map.parameter, shape, periods * cls.bytes_per_texel)
 
     def cached(self, build: Callable[[], Mapping[str, np.ndarray]], *parameters: object) -> dict:
         """Arrays from the cache on disk, or from ``build()``; see :func:`~.load_or_build`.

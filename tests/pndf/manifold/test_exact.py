@@ -212,6 +212,22 @@ def test_a_damaged_cache_is_rebuilt(variant, monkeypatch, tmp_path):
     assert cache.directory() == tmp_path and len(file.read_bytes()) == len(whole)
 
 
+def test_a_full_disk_costs_only_the_cache(variant, monkeypatch, tmp_path, told):
+    resource = pytest.importorskip("resource")  # not on Windows
+    monkeypatch.setenv("GLINTBSDF_CACHE", str(tmp_path))
+    cache._warn_once.cache_clear()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # bytes of any file
+    try:
+        without = Manifold(noise((41, 40)))
+        assert without.lists is not None
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    (text,) = told()
+    assert "builds without its cache" in text
+    assert not list(tmp_path.glob("*.npz")) and not list(tmp_path.glob("*.tmp"))
+
+
 def test_new_data_are_checked_and_used(variant):
     pndf = Manifold(noise((16, 16)))
     other = noise((16, 16), spread=0.1)

@@ -512,6 +512,7 @@ class Elements(Mixture):
 
     normal_map: NormalMap
     integrates_lights = True
+    bytes_per_texel = 110.0
 
     def __init__(
         self,
@@ -525,6 +526,7 @@ class Elements(Mixture):
     ) -> None:
         check_sigma_r(owner, sigma_r)
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
+        self.check_room(normal_map, owner, domain)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
         self.wrap_mode = normal_map.wrap_mode
         self.data = stored(mi.TensorXf, normal_map.normals) if data is None else data

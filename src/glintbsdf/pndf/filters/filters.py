@@ -204,6 +204,7 @@ class Filtered(PNDF):
     normal_map: NormalMap
 
     maskings = ("footprint", "smith", "none")
+    bytes_per_texel = 100.0
 
     def __init__(
         self,
@@ -231,6 +232,7 @@ class Filtered(PNDF):
         self.alpha = None if alpha is None else mi.Float(alpha)
         self.max_alpha = 1.0 if method == "toksvig" else inf
         self.check_alpha()
+        self.check_room(normal_map, owner, domain)
         self.data = stored(mi.TensorXf, normal_map.normals)
         self.normal_map = normal_map
         self.build(domain)
@@ -238,12 +240,13 @@ class Filtered(PNDF):
     def build(self, domain: Domain | None = None) -> None:
         """Check the slopes of ``self.data``, and build its MIP chain."""
         self.domain = domain
-        z_squared = 1 - (self.normal_map.normals.astype(np.float64) ** 2).sum(axis=2)
+        normals = self.normal_map.normals
+        squared = np.einsum("ijk,ijk->ij", normals, normals, dtype=np.float64)
         check_texels(
             self.owner,
             "data",
             f"a map with slopes up to {MAX_SLOPE}",
-            {"steeper": z_squared * (1 + MAX_SLOPE**2) < 1},
+            {"steeper": squared > MAX_SLOPE**2 / (1 + MAX_SLOPE**2)},
         )
 
         def make() -> MomentPyramid:

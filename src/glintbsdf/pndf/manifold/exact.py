@@ -57,6 +57,7 @@ class Manifold(TexelMesh, PNDF):
 
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
+    bytes_per_texel = 80.0
 
     def __init__(
         self,
@@ -66,6 +67,7 @@ class Manifold(TexelMesh, PNDF):
         owner: str = "Manifold",
         domain: Domain | None = None,
     ) -> None:
+        self.check_room(normal_map, owner, domain)
         super().__init__(normal_map, kernel, epsilon, owner)
         self.build(domain)
 
