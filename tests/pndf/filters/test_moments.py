@@ -172,3 +172,19 @@ def test_derivatives_reach_the_map(variant):
         moved = NormalMap(MAPS["isotropic"].normals + np.float32([sign * step, 0]))
         values.append(pyramid(moved).average(footprint)[2][0])
     assert np.isclose(gradient[..., 0].sum(), (values[1] - values[0]) / (2 * step), rtol=1e-2)
+
+
+@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+def test_strips_make_the_same_levels(variant, monkeypatch, wrap_mode):
+    normal_map = NormalMap(MAPS["isotropic"].normals, wrap_mode)
+    uv, axes = footprints(200, 3, 1)
+    whole = averages(pyramid(normal_map), uv, axes)
+    monkeypatch.setattr(moments, "STRIP", 500)
+    assert np.allclose(averages(pyramid(normal_map), uv, axes), whole, rtol=1e-3, atol=1e-5)
+    for scale in (moments.COARSE, moments.FINE):
+        chains = []
+        for strip in (500, 1 << 20):
+            monkeypatch.setattr(moments, "STRIP", strip)
+            chains.append(averages(pyramid(normal_map, scale=scale, first=1), uv, axes * 3))
+        # The positions of samples are rounded otherwise.
+        assert np.allclose(*chains, rtol=1e-3, atol=1e-5)

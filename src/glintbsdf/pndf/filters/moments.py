@@ -116,8 +116,9 @@ class Scale(NamedTuple):
 #: Three levels per octave, for lobes that are made of the averages.
 FINE = Scale(1.0, 2 ** (1 / 3), 0.8)
 
-#: One level per octave, and none as fine as the map. Such a chain has a sixteenth of the memory.
-COARSE = Scale(1.6, 2.0, 1.25)
+#: Two levels per octave, and none as fine as the map, for masking. In packed records such a chain
+#: takes 5 bytes per texel, a tenth of the memory of lists of quads and their vertices.
+COARSE = Scale(2 * sqrt(2), sqrt(2), 1.0)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -281,11 +282,17 @@ def smooth(
     return central(origin, [total / weights for total in totals], spread)
 
 
-def texel_normals(normals, axes: tuple[SampleAxis, SampleAxis], rows: range):
-    """The normals (``mi.Vector2f``) of some rows of texels."""
+def texel_normals(
+    normals,
+    texels: tuple[SampleAxis, SampleAxis],
+    axes: tuple[SampleAxis, SampleAxis],
+    rows: range,
+):
+    """The normals (``mi.Vector2f``) at some rows of the samples of ``axes``, which are texels."""
     row, column = axes[1].divided(dr.arange(mi.UInt32, len(rows) * axes[1].count))
-    row = axes[0].wrapped(mi.Int(row) + opaque(mi.Int, rows.start))
-    return dr.gather(mi.Vector2f, normals, row * mi.UInt32(axes[1].samples) + column)
+    row = texels[0].wrapped(mi.Int(row) + opaque(mi.Int, rows.start + int(axes[0].origin)))
+    column = texels[1].wrapped(mi.Int(column) + int(axes[1].origin))
+    return dr.gather(mi.Vector2f, normals, row * mi.UInt32(texels[1].samples) + column)
 
 
 def quad_axes(axes: tuple[SampleAxis, SampleAxis]) -> tuple[SampleAxis, SampleAxis]:
@@ -492,11 +499,12 @@ class MomentPyramid:
             self.top = last + 1
 
         self.texels, self.normals = texels, normals
-        self.shapes = {0: texels} | {
+        self.shapes = {
             number: tuple(
-                level_axis(n, scale.spacing_of(number), self.periodic) for n in (rows, columns)
+                level_axis(n, scale.spacing_of(number) if number else 1.0, self.periodic)
+                for n in (rows, columns)
             )
-            for number in range(1, self.top + 1)
+            for number in range(self.top + 1)
         }
         self.windows = self.choose_windows(domain)
         over_quad = over_quad or partial(midpoint_rule, moments, spread)
@@ -539,7 +547,7 @@ class MomentPyramid:
                 plan = self.plan(base[0], coarse, k, strips)
                 if self.first == 0:
                     rows = plan[0].own
-                    texels = texel_normals(self.normals, self.texels, rows)
+                    texels = texel_normals(self.normals, self.texels, self.shapes[0], rows)
                     self.keep(0, record_of(moments, spread, texels), Strip(rows, rows))
                 level, axes = records, base
                 if records is None:
@@ -569,7 +577,7 @@ class MomentPyramid:
         axes = [base] + [self.shapes[number][0] for number in range(1, coarse + 1)]
         plan = [Strip(own(axes[-1]), own(axes[-1]))]
         for number in range(coarse, 0, -1):
-            mine = own(self.texels[0] if number == 1 else axes[number - 1])
+            mine = own(self.shapes[number - 1][0])
             rows = range(axes[number - 1].count)
             if strips > 1:
                 reach = CUT * sqrt(self.added_variance(number))

@@ -1,10 +1,10 @@
 """Records of moments in memory: means, and central second moments.
 
 A record is packed into as few words as keep its digits. Of a mean, the 24 upper bits of a float are
-stored, with an error of 1e-5 of its value. Central second moments are stored as their roots, which
-are half floats. A covariance has a triangular root, so that its determinant keeps its digits, too.
-The error of a variance is 1e-3 of its value; it counts as zero below 1e-12. Three words then hold
-the mean and the covariance of slopes, where floats would take five.
+stored, with an error of at most 1.6e-5 of its value. Central second moments are stored as their
+roots, which are half floats. A covariance has a triangular root, so that its determinant keeps its
+digits, too. The error of a variance is 1e-3 of its value; it counts as zero below 1e-12. Three
+words then hold the mean and the covariance of slopes, where floats would take five.
 
 Derivatives need floats: a sum of very many small derivatives has no room in a half float.
 """
