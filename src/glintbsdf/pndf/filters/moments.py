@@ -528,6 +528,7 @@ class MomentPyramid:
         sizes = [samples(self.windows[number]) for number in numbers]
         ends = np.cumsum([0, *sizes]).tolist()
         self.begin = dict(zip(numbers, ends[:-1], strict=True))
+        self.records: PackedRecords | FloatRecords
         if spread and not dr.grad_enabled(self.normals):
             means = self.channels - len(spread)
             self.records = PackedRecords(ends[-1], means, len(spread))
