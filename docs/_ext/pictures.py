@@ -65,7 +65,7 @@ class PluginPictures(Pictures):
         samples = f", {shown['spp']} samples per pixel" if "spp" in shown else ""
         figures = []
         for value in shown["values"]:
-            text = f"{shown['parameter']} = {value}"
+            text = f"{shown['parameter']} {value}"
             file = f"images/plugins/{plugin}_{value}.png"
             figures.append((file, f"A ball with {text}", f":monosp:`{text}`{samples}"))
         return self.side_by_side("variations", figures)
