@@ -151,7 +151,7 @@ class GlintFiltered(GlintBSDF):
             self.masking_name,
         )
         self.height_correlated = parameters.boolean("height_correlated", True)
-        self.finish()
+        self.finish(Filtered)
 
     def create(self, domain: Domain | None) -> Filtered:
         return Filtered(self.normal_map, domain=domain, **self.options)

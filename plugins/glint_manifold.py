@@ -182,7 +182,7 @@ class GlintManifold(GlintBSDF):
         self.masking_name = parameters.choice("masking", "ggx_fit", Manifold.maskings)
         self.height_correlated = parameters.boolean("height_correlated", True)
         self.hand_over = parameters.number("hand_over", 0.0)
-        self.finish()
+        self.finish(self.method)
 
     def create(self, domain: Domain | None) -> PNDF:
         pndf = self.method(self.normal_map, domain=domain, **self.options)

@@ -30,15 +30,15 @@ Mitsuba's path tracer, in which glints know the size of a pixel at every bounce.
 
  * - pixel_share
    - |string| or |float|
-   - Share of the pixel filter's variance that footprints carry, in [0, 1]; samples are placed with
-     the rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 for a
+   - Share of the pixel filter's variance that footprints carry, in [0, 1]; they are placed with the
+     rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 for a
      single sample per pixel, and falls slowly with their number)
 
  * - light_share
    - |string| or |float|
    - Share of a small light's extent that P-NDFs integrate, in [0, 1]; the rest is sampled. 0 is
-     sampling alone. (Default: :monosp:`auto`, which is 1 for a single sample per pixel, and falls
-     slowly with their number)
+     sampling alone. (Default: :monosp:`auto`, which is 1 up to 1024 samples per pixel, and then
+     falls slowly with their number)
 
  * - emitters
    - |string|
@@ -68,8 +68,10 @@ Derivatives treat the partials as constants.
 
 **Footprints and samples share the pixel's filter.** The value of a pixel is the image filtered by
 the film's reconstruction filter, of variance Σ. Footprints filter as well, so they carry a share
-:math:`a` of Σ. Samples are drawn from the filter, contracted by :math:`\sqrt{1 - a}` towards the
-pixel's centre, and each counts in one pixel only (filter importance sampling :cite:`Ernst2006`).
+:math:`a` of Σ. Samples are drawn from the filter, and each counts in one pixel only (filter
+importance sampling :cite:`Ernst2006`). The footprint of a sample is contracted by
+:math:`\sqrt{1 - a}` towards the pixel's centre, on the shape that the sample sees; so the edges of
+shapes, and materials without footprints, have the whole filter.
 Variances add. So with Mitsuba's default filter, a Gaussian, both together are exactly the filter,
 whatever :math:`a` is; with other filters they have its mean and variance. Mitsuba scales ray
 differentials by :math:`1/\sqrt{\mathrm{spp}}` instead. Footprints of this size cover the pixel only
@@ -87,11 +89,14 @@ the image does.
 Environments are not small. One of the remaining emitters is chosen in proportion to its
 ``sampling_weight``.
 
-**The P-NDF integrates small lights** in BSDFs that are able to do so, which is
-:ref:`glint_elements <bsdf-glint_elements>`. A light is small if it looks like a disk with a radius
-of at most 0.5 radians, or like another surface with such a variance of directions. This variance is
-split as the pixel's filter is. A share becomes a spread of half vectors, over which the P-NDF is
-averaged in closed form. The rest is sampled, by directions contracted towards the light's centre.
+**The P-NDF integrates small lights** in BSDFs that are able to do so, which are
+:ref:`glint_elements <bsdf-glint_elements>`, :ref:`glint_manifold <bsdf-glint_manifold>`,
+:ref:`glint_filtered <bsdf-glint_filtered>` and :ref:`glint_particles <bsdf-glint_particles>`. A
+light is small if it looks like a disk with a radius of at most 0.5 radians, or like another surface
+with such a variance of directions. This variance is
+split as the pixel's filter is. A share becomes a spread of half vectors, a uniform ellipse, over
+which the P-NDF is averaged in closed form. The rest is sampled, by directions contracted towards
+the light's centre. A share of 1 leaves no noise except that of shadows and textures of the light.
 Visibility and radiance are taken at the sampled points, so shadows and textures keep their mean.
 BSDF sampling then leaves these lights out, and nothing counts twice.
 
@@ -152,7 +157,12 @@ import mitsuba as mi
 
 from glintbsdf.bridge import filter_sampling
 from glintbsdf.bridge.bsdf import prepare_for_lights
-from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried, half_vector_turn
+from glintbsdf.bridge.carried import (
+    HAS_FOOTPRINT,
+    INTEGRATES_LIGHTS,
+    Carried,
+    half_vector_turn,
+)
 from glintbsdf.bridge.filter_sampling import SharedFilter
 from glintbsdf.bridge.parameters import Parameters
 from glintbsdf.bridge.registration import register_plugin
@@ -164,6 +174,7 @@ from glintbsdf.footprint.pixel_filter import (
     automatic_share,
 )
 from glintbsdf.footprint.raycone import RayCone, curved_interaction, lobe_width
+from glintbsdf.lights import small
 from glintbsdf.lights.small import SmallLights
 
 
@@ -185,7 +196,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         self.pixel_share = parameters.share("pixel_share")
         self.light_share = parameters.share("light_share")
         self.emitters = parameters.choice("emitters", "all", ("all", "one"))
-        self.pixels_per_differential = None
+        self.pixels_per_differential = self.shared = None
 
     # ------------------------------------------------------------------------------------------
     #  The pixel's filter
@@ -235,10 +246,11 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             return
         share = automatic_share(samples) if automatic else self.pixel_share
         self.pixels_per_differential = (share * pixel_filter.variance) ** 0.5 / PIXEL_SIGMA
+        self.shared = SharedFilter(pixel_filter, (1 - share) ** 0.5)
         try:
-            yield SharedFilter(pixel_filter, (1 - share) ** 0.5)
+            yield self.shared
         finally:
-            self.pixels_per_differential = None
+            self.pixels_per_differential = self.shared = None
 
     def sized(self, ray: mi.RayDifferential3f, samples: int) -> mi.RayDifferential3f:
         """The sensor's ray, with differentials rescaled to the size of footprints. Mitsuba passes
@@ -251,9 +263,46 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         sized.scale_differential(dr.opaque(mi.Float, self.pixels_per_differential * samples**0.5))
         return sized
 
+    def to_footprints(
+        self,
+        scene: mi.Scene,
+        ray: mi.RayDifferential3f,
+        pi: mi.PreliminaryIntersection3f,
+        samples: int,
+        active: mi.Bool,
+    ) -> tuple[mi.RayDifferential3f, mi.PreliminaryIntersection3f]:
+        """The rays through the centres of footprints, and what they hit, in place of the sensor's
+        rays that hit a BSDF with a footprint. Where both do not hit the same shape, the sensor's
+        own ray stays: what a pixel sees is decided by its samples, which lie as the filter says.
+
+        Args:
+            ray: the sensor's rays, whose differentials Mitsuba has scaled by 1/√``samples``.
+            pi: what they hit.
+        """
+        if self.shared is None or self.shared.footprint_ray is None or not ray.has_differentials:
+            return ray, pi
+        moved = self.shared.footprint_ray
+        scale = dr.opaque(mi.Float, samples**-0.5)
+        wanted = active & pi.is_valid()
+        wanted &= (pi.shape.bsdf().flags() & HAS_FOOTPRINT) != 0
+        other = scene.ray_intersect_preliminary(mi.Ray3f(moved), coherent=True, active=wanted)
+        same = wanted & other.is_valid() & (other.shape == pi.shape)
+        same &= other.instance == pi.instance
+        result = mi.RayDifferential3f(dr.select(same, mi.Ray3f(moved), mi.Ray3f(ray)))
+
+        def step(of_footprint: mi.Vector3f, of_ray: mi.Vector3f) -> mi.Vector3f:
+            return dr.select(same, scale * of_footprint, of_ray)
+
+        result.o_x = result.o + step(moved.o_x - moved.o, ray.o_x - ray.o)
+        result.o_y = result.o + step(moved.o_y - moved.o, ray.o_y - ray.o)
+        result.d_x = result.d + step(moved.d_x - moved.d, ray.d_x - ray.d)
+        result.d_y = result.d + step(moved.d_y - moved.d, ray.d_y - ray.d)
+        result.has_differentials = True
+        return result, dr.select(same, other, pi)
+
     def share_of_lights(self, samples: int) -> float:
         """The share of a light's extent that the P-NDF integrates."""
-        return automatic_share(samples) if self.light_share == "auto" else self.light_share
+        return small.automatic_share(samples) if self.light_share == "auto" else self.light_share
 
     @dr.syntax
     def sample(
@@ -275,6 +324,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             prepare_for_lights()
         lights = SmallLights(scene, self.emitters == "all" and filters, share > 0)
         light_share = dr.opaque(mi.Float, share) if share > 0 else None
+        active = mi.Bool(active)
+        pi = scene.ray_intersect_preliminary(mi.Ray3f(ray_), coherent=True, active=active)
+        ray_, pi = self.to_footprints(scene, ray_, pi, sampler.sample_count(), active)
         ray_ = self.sized(ray_, sampler.sample_count())
         samples = dr.opaque(mi.Float, sampler.sample_count())
 
@@ -282,7 +334,6 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
         ray = mi.Ray3f(ray_)  # Current ray
         cone = RayCone.from_ray(ray_)  # Its width, for footprints
-        active = mi.Bool(active)  # Active SIMD lanes
         L = mi.Spectrum(0)  # Radiance accumulator; of indirect light only if it is separate
         β = mi.Spectrum(1)  # Path throughput weight
         η = mi.Float(1)  # Index of refraction
@@ -302,8 +353,6 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
         # An environment is always visible, everything else once a path has hit it
         valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
-
-        pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
 
         # ---------------------- Hide area emitters ----------------------
 

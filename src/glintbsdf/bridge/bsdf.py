@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.bridge.carried import INTEGRATES_LIGHTS, Carried
+from glintbsdf.bridge.carried import HAS_FOOTPRINT, INTEGRATES_LIGHTS, Carried
 from glintbsdf.bridge.parameters import EXTINCTION, Parameters, check_to_uv, declared_range
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
@@ -364,6 +364,7 @@ class GlintBSDF(FootprintBSDF):
             | mi.BSDFFlags.FrontSide
             | mi.BSDFFlags.SpatiallyVarying
             | mi.BSDFFlags.Anisotropic
+            | HAS_FOOTPRINT
             for component in self.interface.components
         ]
         self.m_flags = self.m_components[0]

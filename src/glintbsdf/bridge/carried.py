@@ -25,8 +25,10 @@ import mitsuba as mi
 
 from glintbsdf.footprint.gaussian import is_literal_zero
 
-#: The bit of ``BSDFFlags``; those of Mitsuba 3.9 end at bit 16.
+#: Bits of ``BSDFFlags``, of BSDFs that integrate lights, and of all that average over footprints;
+#: those of Mitsuba 3.9 end at bit 16.
 INTEGRATES_LIGHTS = 1 << 30
+HAS_FOOTPRINT = 1 << 29
 
 #: The component along the normal of ``dn_dv`` if the interaction carries data.
 MARK = 1.0

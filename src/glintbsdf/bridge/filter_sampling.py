@@ -2,7 +2,7 @@
 
 Mitsuba's integrators draw samples uniformly over the image, and the film's filter distributes each
 of them over the pixels around it. Here each sample belongs to one pixel. Its offset from the
-pixel's centre is drawn from the filter, and may be contracted, see
+pixel's centre is drawn from the filter. The offset of its footprint is contracted, see
 :mod:`~glintbsdf.footprint.pixel_filter`.
 """
 
@@ -24,17 +24,20 @@ LARGEST_WAVEFRONT = 2**32 - 1
 LATTICE_STEPS = 0.7548776662466927, 0.5698402909980532
 
 
-@dataclass(frozen=True)
+@dataclass
 class SharedFilter:
     """A film's filter, of which footprints carry a share.
 
     Attributes:
         pixel_filter (PixelFilter): the film's filter.
-        contraction (float): factor on a sample's offset from its pixel's centre, in [0, 1].
+        contraction (float): factor on the offset of a footprint from its pixel's centre, in [0, 1].
+        footprint_ray (mi.RayDifferential3f): the rays through the centres of the footprints of the
+            samples that have been placed last, with the differentials of a pixel; None before.
     """
 
     pixel_filter: PixelFilter
     contraction: float
+    footprint_ray: mi.RayDifferential3f | None = None
 
     def place(
         self, sampler: mi.Sampler, x: mi.UInt32, y: mi.UInt32, order: mi.UInt32, seed: mi.UInt32
@@ -49,8 +52,30 @@ class SharedFilter:
             random = lattice_point(order, x, y, seed)
         else:
             random = sampler.next_2d()
-        offset, sign = self.pixel_filter.sample(random)
-        return offset * dr.opaque(mi.Float, self.contraction), sign
+        return self.pixel_filter.sample(random)
+
+    def rays(
+        self,
+        sensor: mi.Sensor,
+        time: mi.Float,
+        wavelength: mi.Float,
+        pixel: mi.Point2f,
+        offset: mi.Vector2f,
+        size: mi.ScalarVector2f,
+        aperture: mi.Point2f,
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """The rays of samples, and their weights. Keeps the rays of their footprints.
+
+        ``pixel``: corner of the pixel, from that of the film's crop window of ``size`` pixels;
+        ``offset``: of the sample from the pixel's centre, pixels.
+        """
+        scale = dr.rcp(mi.ScalarVector2f(size))
+        contracted = offset * dr.opaque(mi.Float, self.contraction)
+        self.footprint_ray, _ = sensor.sample_ray_differential(
+            time, wavelength, (pixel + 0.5 + contracted) * scale, aperture
+        )
+        place = (pixel + 0.5 + offset) * scale
+        return sensor.sample_ray_differential(time, wavelength, place, aperture)
 
     def channels(
         self, sign: mi.Float, values: list[mi.Float], aovs: list[mi.Float]
@@ -131,14 +156,14 @@ def add_samples(
     seed = mi.UInt32(seed)
     dr.make_opaque(seed)  # Mitsuba gives a literal, which would be a part of the kernel
     jitter, sign = shared.place(sampler, x, y, order, seed)
-    place = (mi.Point2f(column, row) + 0.5 + jitter) * dr.rcp(mi.ScalarVector2f(size))
 
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time = time + sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
-    ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
+    pixel = mi.Point2f(column, row)
+    ray, weight = shared.rays(sensor, time, wavelength, pixel, jitter, size, aperture)
     if ray.has_differentials:
         ray.scale_differential(dr.rsqrt(dr.opaque(mi.Float, sampler.sample_count())))
 

@@ -2,9 +2,9 @@
 
 The value of a pixel is the image filtered by the film's reconstruction filter, of variance Σ along
 each axis. A footprint of variance a Σ filters what it covers; what is left of the filter is drawn:
-samples lie about the pixel's centre as the filter itself would place them, contracted by √(1 − a),
-so that they vary by (1 − a) Σ. Variances add, so for a Gaussian filter the two together are the
-filter, whatever the share a; with any other filter they agree in mean and variance.
+footprints lie about the pixel's centre as the filter itself would place them, contracted by
+√(1 − a), so that they vary by (1 − a) Σ. Variances add, so for a Gaussian filter the two together
+are the filter, whatever the share a; with any other filter they agree in mean and variance.
 
 With footprints of Σ/N instead, as the usual scaling of ray differentials by 1/√N makes them, N
 samples cover the pixel by chance, whatever N: the error hardly falls.
@@ -38,7 +38,7 @@ def automatic_share(samples: int) -> float:
     Footprints are an approximation, and what they leave out of a pixel counts less the smaller they
     are: a falls with the number of samples, so slowly that the samples' noise falls as before.
     """
-    return float(samples) ** -0.25
+    return float(samples) ** -0.125
 
 
 class PixelFilter:

@@ -11,7 +11,8 @@ s(u) = s₀ + H (u − u₀). The P-NDF is then ``∫ k(u) δ(n(u) − s(u)) du`
 n(u) − H (u − u₀): every Jacobian J of the map becomes J − H.
 
 **The spread** Σ in normal space. Under a light of some extent the half vector covers a region
-around s₀. The P-NDF is averaged over a Gaussian of this covariance.
+around s₀. The P-NDF is averaged over a uniform ellipse of this covariance, as a round light is one.
+A method may take a Gaussian of this covariance instead.
 """
 
 from __future__ import annotations

@@ -135,8 +135,8 @@ def _camera_rays(
         place, sign = sampler.next_2d(), mi.Float(1)
     else:
         order = number - pixel * per_pixel
-        place, sign = shared.place(sampler, x, y, order, dr.opaque(mi.UInt32, seed))
-        place = place + 0.5
+        offset, sign = shared.place(sampler, x, y, order, dr.opaque(mi.UInt32, seed))
+        place = offset + 0.5
     position = mi.Point2f(mi.Float(x), mi.Float(y)) + place
 
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
@@ -145,12 +145,14 @@ def _camera_rays(
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     wavelength = sampler.next_1d() if mi.is_spectral else 0
-    ray, weight = sensor.sample_ray_differential(
-        time=time,
-        sample1=wavelength,
-        sample2=(position - mi.ScalarVector2f(film.crop_offset())) * scale,
-        sample3=aperture,
-    )
+    corner = mi.ScalarVector2f(film.crop_offset())
+    if shared is None:
+        on_film = (position - corner) * scale
+        ray, weight = sensor.sample_ray_differential(time, wavelength, on_film, aperture)
+    else:
+        at = mi.Point2f(mi.Float(x), mi.Float(y)) - corner
+        size = film.crop_size()
+        ray, weight = shared.rays(sensor, time, wavelength, at, offset, size, aperture)
     return ray, weight, position, sign
 
 

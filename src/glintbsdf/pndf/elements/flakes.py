@@ -210,7 +210,7 @@ class Flakes(Mixture):
         return mi.Vector2f(x, y), mi.Vector2f(normal_x, normal_y)
 
     def lobes(self, kernel, query=None):
-        roughness = Gaussian(query.spread if query else (), dr.square(self.sigma_r))
+        roughness = Gaussian((), dr.square(self.sigma_r))
 
         def lobes(row, column, corner, active):
             place, normal = self.flake(row, column, active)

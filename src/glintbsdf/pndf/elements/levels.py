@@ -17,29 +17,60 @@ Q + J S Jᵀ + s sᵀ.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, sqrt
+from math import ceil, pi, sqrt
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.loops import symbolic_loop
-from glintbsdf.footprint.kernels import TexelKernel
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import TexelKernel, difference_of_products
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
-from glintbsdf.pndf.gaussian_elements import SIGMA_H, Gaussian, Overlap
+from glintbsdf.pndf.gaussian_elements import (
+    SIGMA_H,
+    Gaussian,
+    Overlap,
+    averaged_over_ellipse,
+)
+from glintbsdf.pndf.manifold.mesh import normal_in_quad
 
-#: Elements are cut where the squared Mahalanobis distance from the footprint's centre is CUT. Their
-#: weight falls linearly to 0 over the width FADE, up to the cut.
-CUT, FADE = 10.0, 2.0
+#: ρ² of the cut of elements, the squared Mahalanobis distance from the footprint's centre, where
+#: the footprint spans a cell. The weight falls linearly to 0 over the width FADE, up to the cut.
+CUT, FADE = 7.0, 2.0
 
-#: The level of a query is the one at which a footprint's minor standard deviation spans about this
-#: many cells,
+
+def cut_at(sigma: mi.Float) -> mi.Float:
+    """ρ² of the cut: farther out for a footprint that covers a few elements only.
+
+    ``sigma``: minor standard deviation of the Gaussian that weights the elements, cells.
+    """
+    return CUT + 4 * dr.maximum(-dr.log2(sigma), 0)
+
+
+def widening(cut: mi.Float) -> mi.Float:
+    """Factor on the covariance of a Gaussian that is cut there: it then has the covariance that it
+    has without a cut.
+
+    ρ² is exponential with a mean of 2. The cut is the mean of sharp cuts at s in [cut − FADE, cut],
+    of mass 1 − exp(−s/2) and of the partial mean 2 − (s + 2) exp(−s/2) of ρ².
+    """
+    inner, outer = dr.exp(-0.5 * (cut - FADE)), dr.exp(-0.5 * cut)
+    mass = 1 - (inner - outer) * (2 / FADE)
+    partial = 2 - ((cut - FADE + 4) * inner - (cut + 4) * outer) * (2 / FADE)
+    return 2 * mass / partial
+
+
+#: The level of a query is the coarsest at which a footprint's minor standard deviation spans about
+#: this many cells,
 CELLS_PER_SIGMA = 2.0
 
-#: or, if that is coarser, the standard deviation of a cell's normals is about this multiple of the
-#: light's spread.
-NORMALS_PER_SPREAD = 1.0
+#: and the normals change by about this multiple of the light's spread from cell to cell,
+NORMALS_PER_SPREAD = 2.0
+
+#: but a footprint's minor standard deviation spans no more cells than this.
+MOST_CELLS_PER_SIGMA = 5.0
 
 #: Reach of the Gaussian that merges elements, on each side of its centre, in standard deviations.
 MERGE_REACH = 4.0
@@ -53,8 +84,17 @@ ROUNDING = 1e-7
 #: Indices of the components of a symmetric 2×2 matrix.
 PAIRS = (0, 0), (0, 1), (1, 1)
 
-#: Floats per element: 2 of the mean, 4 of the Jacobian, 3 of a root of the residual covariance.
-NUMBERS = 9
+#: Elements of a row that one step of the loop adds.
+UNROLLED = 2
+
+#: Floats per element: 2 of the mean, 4 of the Jacobian, and xx and yy of the residual covariance.
+#: Its xy is in an array of its own, as gathers of 8 floats are fast.
+NUMBERS = 8
+
+#: Nodes of Gauss and Hermite's rule along an axis of the mesh, for the Gaussian of a texel: the
+#: corner of the quad relative to the texel before, and the place in the quad; and their weights.
+NODES = (0, 1 - sqrt(3) * SIGMA_H), (1, 0.0), (1, sqrt(3) * SIGMA_H)
+WEIGHTS = 1 / 6, 2 / 3, 1 / 6
 
 
 @dataclass
@@ -103,33 +143,40 @@ class Levels:
         )
 
         tables: list[mi.Float] = []
+        products: list[mi.Float] = []
         sizes, offsets, raw = [], [], base
         while not tables or max(raw.counts) > 1:
             if tables:
                 raw = merged(merged(raw, 0, wrap_mode), 1, wrap_mode)
             offsets.append(sum(len(t) for t in tables) // NUMBERS)
-            tables.append(elements_of(raw))
+            table, product = elements_of(raw)
+            tables.append(table)
+            products.append(product)
             sizes.append(raw.counts)
         self.count = len(tables)
         self.table = dr.concat(tables) if self.count > 1 else tables[0]
+        self.products = dr.concat(products) if self.count > 1 else products[0]
         self.columns = mi.Int([size[0] for size in sizes])
         self.rows = mi.Int([size[1] for size in sizes])
         self.offsets = mi.UInt32(offsets)
         self.texels = mi.Vector2f(width, height)
         dr.make_opaque(self.columns, self.rows, self.offsets, self.lower, self.upper, self.texels)
-        dr.eval(self.table)
-        self.nbytes = 4 * dr.width(self.table)
+        dr.eval(self.table, self.products)
+        self.nbytes = 4 * (dr.width(self.table) + dr.width(self.products))
 
     def level_for(self, kernel: TexelKernel, spread: mi.Float) -> mi.UInt32:
-        """Index of the level that answers a query, the coarsest that footprint or spread allows.
+        """Index of the level that answers a query, the coarsest that footprint and spread allow.
 
         Args:
             kernel: the footprint, in texels.
             spread: standard deviation of the light's spread of projected normals.
         """
-        by_footprint = dr.sqrt(kernel.minor_variance) * (1 / CELLS_PER_SIGMA)
+        sigma = dr.sqrt(kernel.minor_variance)
         by_spread = spread * dr.opaque(mi.Float, NORMALS_PER_SPREAD / self.slope)
-        level = dr.round(dr.log2(dr.maximum(by_footprint, by_spread)))
+        cell = dr.maximum(
+            dr.minimum(sigma * (1 / CELLS_PER_SIGMA), by_spread), sigma * (1 / MOST_CELLS_PER_SIGMA)
+        )
+        level = dr.round(dr.log2(cell))
         return mi.UInt32(dr.clip(level, 0, self.count - 1))
 
     def eval(
@@ -148,28 +195,41 @@ class Levels:
         footprint, turn = query.footprint, query.turn
         height, width = self.texels.y, self.texels.x
         kernel = TexelKernel("gaussian", footprint, height, width, self.wrap_mode, (0.0, 0.0))
-        rough = Gaussian(query.spread, variance)
-        widest = dr.sqrt(dr.maximum(rough.xx, rough.yy))
-        level = self.level_for(kernel, dr.sqrt(dr.sqrt(rough.determinant)))
+        light = Gaussian(query.spread)
+        widest = dr.sqrt(dr.maximum(light.xx, light.yy) + variance)
+        level = self.level_for(kernel, dr.sqrt(dr.sqrt(light.determinant) + variance))
         columns = dr.gather(mi.Int, self.columns, level, active)
         rows = dr.gather(mi.Int, self.rows, level, active)
         offset = dr.gather(mi.UInt32, self.offsets, level, active)
 
         size = mi.Vector2f(columns, rows)
-        variances = (SIGMA_H**2, SIGMA_H**2)
-        kernel = TexelKernel("gaussian", footprint, size.y, size.x, self.wrap_mode, variances)
-        kernel.cut_at(sqrt(CUT))
-        overlap = Overlap(Gaussian((kernel.du, kernel.dv)), Gaussian(variance=SIGMA_H**2))
+        cells = kernel.minor_variance * (size.x * size.y / (width * height))
+        cut = cut_at(dr.sqrt(cells + SIGMA_H**2))
+        wide = widening(cut)
+        root = dr.sqrt(wide)
+        axes = [axis * root for axis in (footprint.du, footprint.dv)]
+        kernel = TexelKernel(
+            "gaussian",
+            Footprint(footprint.uv, *axes),
+            size.y,
+            size.x,
+            self.wrap_mode,
+            (wide * SIGMA_H**2, wide * SIGMA_H**2),
+        )
+        kernel.cut_at(dr.sqrt(cut))
+        axes = tuple(axis / root for axis in (kernel.du, kernel.dv))
+        overlap = Overlap(Gaussian(axes), Gaussian(variance=SIGMA_H**2))
         if turn is not None:  # per cell
             turn = mi.Matrix2f(
                 turn[0, 0] / size.x, turn[0, 1] / size.y, turn[1, 0] / size.x, turn[1, 1] / size.y
             )
+            turn_x, turn_y = (mi.Vector2f(turn[0, k], turn[1, k]) for k in (0, 1))
 
         margin = MARGIN * widest
         if turn is not None:
             # The half vector turns this far over the footprint.
             turned = [dr.squared_norm(turn @ v) for v in (kernel.du, kernel.dv)]
-            margin = margin + sqrt(CUT) * dr.sqrt(turned[0] + turned[1])
+            margin = margin + dr.sqrt(cut * (turned[0] + turned[1]))
         active = mi.Bool(active) & dr.all((m > self.lower - margin) & (m < self.upper + margin))
 
         mean = mi.Vector2f(kernel.mean)
@@ -179,31 +239,53 @@ class Levels:
             left, right = kernel.row_at(mi.Float(y) - mean.y)
             return -floor_int(-mean.x - left), floor_int(mean.x + right)
 
-        def body(x, right, y, active, density, mass):
+        def add(x, y, start, flip_y, inside, density, mass):
             d = mi.Vector2f(x, y) - mean
-            inside = active & (x <= right)
-            weight = dr.clip((CUT - dr.squared_norm(kernel.whitened(d))) * (1 / FADE), 0, 1)
-            weight = dr.select(inside, weight * overlap.mass(d), 0)
+            rho_squared = dr.squared_norm(kernel.whitened(d))
+            weight = dr.clip((cut - rho_squared) * (1 / FADE), 0, 1)
+            weight = dr.select(inside, weight * dr.exp(-0.5 * rho_squared), 0)
             column, flip_x = wrapped(x, columns, self.wrap_mode)
-            line, flip_y = wrapped(y, rows, self.wrap_mode)
-            index = offset + mi.UInt32(line * columns + column)
-            e = [dr.gather(mi.Float, self.table, NUMBERS * index + k, inside) for k in range(9)]
-            jacobian = mi.Matrix2f(e[2] * flip_x, e[4] * flip_y, e[3] * flip_x, e[5] * flip_y)
+            index = start + mi.UInt32(column)
+            e = dr.gather(mi.ArrayXf, self.table, index, inside, shape=(NUMBERS, 1))
+            product = dr.gather(mi.Float, self.products, index, inside)
             normal = mi.Vector2f(e[0], e[1])
+            along_x, along_y = mi.Vector2f(e[2], e[3]) * flip_x, mi.Vector2f(e[4], e[5]) * flip_y
             if turn is not None:
-                normal, jacobian = normal - turn @ d, jacobian - turn
-            # Q = a aᵀ + b bᵀ, and J C Jᵀ
-            residual = (mi.Vector2f(e[6], e[7]), mi.Vector2f(0, e[8]))
-            roughness = Gaussian(residual + rough.vectors, rough.variance)
-            normals = overlap.normals(jacobian, roughness)
-            delta = m - normal + jacobian @ overlap.mean(d)
-            density = dr.fma(weight, normals.eval(delta), density)
-            mass = mass + weight
+                normal = normal - turn @ d
+                along_x, along_y = along_x - turn_x, along_y - turn_y
+            # Q + J C Jᵀ, and the roughness that all elements have in common
+            a, b = (along_x * c.x + along_y * c.y for c in overlap.root)
+            xx = variance + e[6] + dr.fma(a.x, a.x, b.x * b.x)
+            xy = product + dr.fma(a.x, a.y, b.x * b.y)
+            yy = variance + e[7] + dr.fma(a.y, a.y, b.y * b.y)
+            step = overlap.mean(d)
+            delta = m - normal + along_x * step.x + along_y * step.y
+            determinant = difference_of_products(xx, yy, xy, xy)
+            form = form_of_adjoint(xx, xy, yy, delta)
+            if query.spread:
+                mixed = xx * light.yy + yy * light.xx - 2 * xy * light.xy
+                seen = averaged_over_ellipse(
+                    (determinant, mixed, light.determinant),
+                    (form, form_of_adjoint(light.xx, light.xy, light.yy, delta)),
+                )
+            else:
+                inverse_root = dr.rsqrt(determinant)
+                seen = inverse_root * (1 / (2 * pi))
+                seen = seen * dr.exp(-0.5 * form * dr.square(inverse_root))
+            return dr.fma(weight, seen, density), mass + weight
 
-            done = x >= right
+        def body(x, right, y, active, density, mass):
+            line, flip_y = wrapped(y, rows, self.wrap_mode)
+            start = offset + mi.UInt32(line * columns)
+            for k in range(UNROLLED):
+                inside = active & (x + k <= right)
+                density, mass = add(x + k, y, start, flip_y, inside, density, mass)
+
+            done = x + UNROLLED > right
             y = dr.select(done, y + 1, y)
             left, new_right = row(y)
-            x, right = dr.select(done, left, x + 1), dr.select(done, new_right, right)
+            x = dr.select(done, left, x + UNROLLED)
+            right = dr.select(done, new_right, right)
             return x, right, y, active & (y <= bottom), density, mass
 
         top = -floor_int(-mean.y + kernel.reach_v)
@@ -214,12 +296,17 @@ class Levels:
             body,
             "coarse elements",
         )
-        return density / dr.select(mass > 0, mass, 1)
+        return dr.maximum(density, 0) / dr.select(mass > 0, mass, 1)
 
 
 # ------------------------------------------------------------------------------------------------
 #  Building
 # ------------------------------------------------------------------------------------------------
+
+
+def form_of_adjoint(xx: mi.Float, xy: mi.Float, yy: mi.Float, d: mi.Vector2f) -> mi.Float:
+    """dᵀ adj(Σ) d, for a symmetric Σ."""
+    return dr.fma(dr.fma(yy, d.x, -2 * xy * d.y), d.x, xx * d.y * d.y)
 
 
 def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int, mi.Float]:
@@ -229,7 +316,7 @@ def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int,
         inside = (index >= 0) & (index < count)
         return dr.clip(index, 0, count - 1), dr.select(inside, mi.Float(1), 0)
     period = count if wrap_mode == "repeat" else 2 * count
-    index = index - floor_int((mi.Float(index) + 0.5) / mi.Float(period)) * period
+    index = index - floor_int((mi.Float(index) + 0.5) * dr.rcp(mi.Float(period))) * period
     if wrap_mode == "repeat":
         return index, mi.Float(1)
     beyond = index >= count
@@ -237,29 +324,36 @@ def wrapped(index: mi.Int, count: mi.Int | int, wrap_mode: str) -> tuple[mi.Int,
 
 
 def finest_level(data: mi.TensorXf, wrap_mode: str) -> RawMoments:
-    """Level 0: one element per texel; central differences give its Jacobian."""
+    """Level 0: one element per texel, with the moments of the texel mesh under its Gaussian, by
+    Gauss and Hermite's rule with three nodes along each axis."""
     height, width, _ = data.shape
     index = dr.arange(mi.Int, width * height)
-    pitch = dr.opaque(mi.Int, width)
+    pitch, lines = dr.opaque(mi.Int, width), dr.opaque(mi.Int, height)
     row = index // pitch
     column = index - row * pitch
-
-    def normals(row, column):
-        place = mi.UInt32(2 * (row * pitch + column))
-        return [dr.gather(mi.Float, data.array, place + k) for k in (0, 1)]
-
-    def difference(before, after):
-        return [0.5 * (b - a) for a, b in zip(before, after, strict=True)]
-
-    lines, columns = dr.opaque(mi.Int, height), pitch
-    left, right = (wrapped(column + step, columns, wrap_mode)[0] for step in (-1, 1))
-    above, below = (wrapped(row + step, lines, wrap_mode)[0] for step in (-1, 1))
-    n = normals(row, column)
-    jx = difference(normals(row, left), normals(row, right))
-    jy = difference(normals(above, column), normals(below, column))
-    variance = SIGMA_H**2
-    nn = [n[i] * n[j] + variance * (jx[i] * jx[j] + jy[i] * jy[j]) for i, j in PAIRS]
-    nx, ny = ([variance * j for j in js] for js in (jx, jy))
+    columns, rows = (
+        [wrapped(centre + step, count, wrap_mode)[0] for step in (-1, 0, 1)]
+        for centre, count in ((column, pitch), (row, lines))
+    )
+    normals = [
+        [dr.gather(mi.Vector2f, data.array, mi.UInt32(y * pitch + x)) for x in columns]
+        for y in rows
+    ]
+    zero = mi.Float(0)
+    n, nx, ny, nn = [zero] * 2, [zero] * 2, [zero] * 2, [zero] * 3
+    for j, (below, v) in enumerate(NODES):
+        for i, (left, u) in enumerate(NODES):
+            corners = [row[left + k] for row in normals[below : below + 2] for k in (0, 1)]
+            normal = normal_in_quad(mi.Float(u), mi.Float(v), corners, 0.0)
+            weight = WEIGHTS[i] * WEIGHTS[j]
+            x, y = (weight * (base - 1 + place) for base, place in ((left, u), (below, v)))
+            n = [dr.fma(weight, s, total) for s, total in zip(normal, n, strict=True)]
+            nx = [dr.fma(x, s, total) for s, total in zip(normal, nx, strict=True)]
+            ny = [dr.fma(y, s, total) for s, total in zip(normal, ny, strict=True)]
+            nn = [
+                dr.fma(weight * normal[a], normal[b], total)
+                for (a, b), total in zip(PAIRS, nn, strict=True)
+            ]
     dr.eval(n, nx, ny, nn)
     return RawMoments(n, nx, ny, nn, (width, height), (1.0, 1.0))
 
@@ -316,11 +410,11 @@ def merged(raw: RawMoments, axis: int, wrap_mode: str) -> RawMoments:
     return RawMoments(n, nx, ny, nn, new_counts, spacings)
 
 
-def elements_of(raw: RawMoments) -> mi.Float:
-    """The elements with these moments, :data:`NUMBERS` floats each.
+def elements_of(raw: RawMoments) -> tuple[mi.Float, mi.Float]:
+    """The elements with these moments: :data:`NUMBERS` floats of each, and xy of each.
 
-    These are the mean; the Jacobian per cell, first its x column, then its y column; and a, b, c of
-    the residual covariance a² = xx, a b = xy, b² + c² = yy.
+    The floats are the mean; the Jacobian per cell, first its x column, then its y column; and xx
+    and yy of the residual covariance.
     """
     (nx, ny), variance = raw.n, SIGMA_H**2
     jx = [v * (1 / (variance * raw.spacing[0])) for v in raw.nx]
@@ -329,14 +423,12 @@ def elements_of(raw: RawMoments) -> mi.Float:
         product - raw.n[i] * raw.n[j] - variance * (jx[i] * jx[j] + jy[i] * jy[j])
         for product, (i, j) in zip(raw.nn, PAIRS, strict=True)
     )
-    # A difference of numbers up to 1 has the rounding error of these numbers. Where the covariance
-    # is nothing but this error, b must not become a quotient of errors.
-    a = dr.sqrt(dr.maximum(xx, 0) + ROUNDING)
-    b = xy / a
-    c = dr.sqrt(dr.maximum(yy - b * b, 0) + ROUNDING)
+    # A difference of numbers up to 1 has the rounding error of these numbers.
+    xx, yy = dr.maximum(xx, 0) + ROUNDING, dr.maximum(yy, 0) + ROUNDING
+    limit = dr.sqrt((xx - 0.5 * ROUNDING) * (yy - 0.5 * ROUNDING))
     count = raw.counts[0] * raw.counts[1]
     table = dr.zeros(mi.Float, NUMBERS * count)
     index = dr.arange(mi.UInt32, count)
-    for k, value in enumerate((nx, ny, jx[0], jx[1], jy[0], jy[1], a, b, c)):
+    for k, value in enumerate((nx, ny, jx[0], jx[1], jy[0], jy[1], xx, yy)):
         dr.scatter(table, value, NUMBERS * index + k)
-    return table
+    return table, dr.clip(xy, -limit, limit)

@@ -11,16 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.hashing import pcg3d, uniform
 from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.kernels import difference_of_products
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels, map_bytes
 from glintbsdf.microfacet.masking import SmithMasking
@@ -28,6 +30,7 @@ from glintbsdf.microfacet.mean_plane import mean_plane_area, visibility
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
 from glintbsdf.pndf.base import PNDF, register
 from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
+from glintbsdf.pndf.gaussian_elements import AveragedGaussian, Gaussian, point_of_ellipse
 from glintbsdf.pndf.sharing import shared
 
 # ------------------------------------------------------------------------------------------------
@@ -138,6 +141,30 @@ def round_lobe(mean: mi.Vector2f, alpha_squared: mi.Float, distribution: str) ->
     )
 
 
+def slope_change(slope: mi.Vector2f, v: mi.Vector2f) -> mi.Vector2f:
+    """The change of a slope x where its projected normal changes by a small ``v``:
+    √(1 + |x|²) (I + x xᵀ) v."""
+    return (v + slope * dr.dot(slope, v)) * dr.sqrt(1 + dr.squared_norm(slope))
+
+
+def widened(lobe: SlopeLobe, vectors: tuple) -> SlopeLobe:
+    """The lobe with twice the products v vᵀ added to its matrix Ω."""
+    added = [
+        sum((2 * v[a] * v[b] for v in vectors), mi.Float(0)) for a, b in ((0, 0), (1, 1), (0, 1))
+    ]
+    return enlarged(lobe, *added)
+
+
+def enlarged(lobe: SlopeLobe, uu: mi.Float, vv: mi.Float, uv: mi.Float) -> SlopeLobe:
+    """The lobe with a symmetric matrix added to Ω, which stays positive: at least 1e-3 of its
+    smaller eigenvalue is left."""
+    least = 1e-3 * lobe.determinant / (lobe.uu + lobe.vv)
+    uu, vv = dr.maximum(lobe.uu + uu, least), dr.maximum(lobe.vv + vv, least)
+    uv = lobe.uv + uv
+    determinant = dr.maximum(difference_of_products(uu, vv, uv, uv), least * (uu + vv))
+    return SlopeLobe(lobe.mean, uu, vv, uv, determinant, lobe.distribution)
+
+
 def positive(x):
     """``x``, or 0 where rounding has made it negative."""
     return dr.maximum(x, 0)
@@ -205,6 +232,7 @@ class Filtered(PNDF):
 
     maskings = ("footprint", "smith", "none")
     bytes_per_texel = 100.0
+    integrates_lights = True
 
     def __init__(
         self,
@@ -287,17 +315,71 @@ class Filtered(PNDF):
             alpha = dr.minimum(query.parameters["alpha"], self.max_alpha)
         return self.method.lobe(averages, dr.square(alpha), self.distribution)
 
+    def lit_lobe(self, query: Query) -> tuple[SlopeLobe, tuple[mi.Vector2f, ...]]:
+        """The lobe of a query with the half vector's turn, and the light's spread of slopes.
+
+        Masking needs neither of them: it depends on the facets alone. They are taken from projected
+        normals to slopes at the lobe's mean.
+        """
+        lobe = self.lobe(query)
+        if query.turn is not None:
+            lobe = query.once((self, "turned lobe"), lambda: self.turned(lobe, query))
+        spread = tuple(slope_change(lobe.mean, v) for v in query.spread)
+        if spread and self.distribution != "beckmann":  # a GGX lobe has no variance
+            lobe = widened(lobe, spread)
+            spread = ()
+        return lobe, spread
+
+    def turned(self, lobe: SlopeLobe, query: Query) -> SlopeLobe:
+        """The lobe of the slopes x(u) − A H (u − u₀): H is the half vector's turn, A takes it to
+        slopes.
+
+        The footprint's axes a add up to Σ_p = Σ a aᵀ. With J Σ_p the covariance of slopes and
+        positions, the covariance C of slopes becomes C + Σ (h hᵀ − j hᵀ − h jᵀ), j = J a and
+        h = A H a. Under a Gaussian J is the derivative of the mean slope with respect to the
+        footprint's centre. It is taken as a difference.
+        """
+        turn, footprint = query.turn, query.footprint
+        assert turn is not None
+        added = [mi.Float(0) for _ in range(3)]
+        for axis in (footprint.du, footprint.dv):
+            before, after = (
+                self.make_lobe(
+                    query.at(Footprint(footprint.uv + s * axis, footprint.du, footprint.dv))
+                ).mean
+                for s in (-0.5, 0.5)
+            )
+            j, h = after - before, slope_change(lobe.mean, turn @ axis)
+            for k, (a, b) in enumerate(((0, 0), (1, 1), (0, 1))):
+                added[k] = added[k] + 2 * (h[a] * h[b] - j[a] * h[b] - h[a] * j[b])
+        return enlarged(lobe, *added)
+
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk; 0 outside of it."""
-        return dr.select(active, self.lobe(query).eval(m), 0)
+        lobe, spread = self.lit_lobe(query)
+        if not spread:
+            return dr.select(active, lobe.eval(m), 0)
+        z_squared = 1 - dr.squared_norm(m)
+        active = active & (z_squared > 0)
+        z_squared = dr.select(active, z_squared, 1)
+        facets = Gaussian(tuple(v * sqrt(0.5) for v in (lobe.f, lobe.g)))
+        density = AveragedGaussian(facets, spread).eval(m * dr.rsqrt(z_squared) - lobe.mean)
+        return dr.select(active, dr.maximum(density, 0) / dr.square(z_squared), 0)
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> mi.Vector2f:
         """Draw a projected normal with density D: one that is visible from the vertical."""
         above = mi.Vector3f(0, 0, 1)
-        normal = self.lobe(query).sample_visible(above, sample1, sample2)
-        return mi.Vector2f(normal.x, normal.y)
+        lobe, spread = self.lit_lobe(query)
+        normal = lobe.sample_visible(above, sample1, sample2)
+        if not spread:
+            return mi.Vector2f(normal.x, normal.y)
+        # The lobe's sample uses up the numbers; the point of the light comes from a hash of them.
+        bits = [dr.reinterpret_array(mi.UInt32, mi.Float(v)) for v in (sample1, *sample2)]
+        point = mi.Point2f(*(uniform(b) for b in pcg3d(*bits)[:2]))
+        x = mi.Vector2f(normal.x, normal.y) / normal.z + point_of_ellipse(spread, point)
+        return x * dr.rsqrt(1 + dr.squared_norm(x))
 
     def sample_visible(self, wi, query, sample1, sample2, active):
         """Draw one of the lobe's normals that are visible from ``wi``."""

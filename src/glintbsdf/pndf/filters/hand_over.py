@@ -55,6 +55,10 @@ class HandOver(PNDF):
         for part in (self.near, self.far):
             part.build(domain)
 
+    def prepare_for_lights(self) -> None:
+        for part in (self.near, self.far):
+            part.prepare_for_lights()
+
     def weight(self, query: Query | Footprint) -> mi.Float:
         """The lobe's weight in the mixture, in [0, 1]."""
         height, width, _ = self.data.shape

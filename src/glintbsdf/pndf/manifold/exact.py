@@ -28,6 +28,10 @@ from glintbsdf.pndf.manifold.mesh import TexelMesh, equilateral, quad_density
 from glintbsdf.pndf.sharing import shared
 from glintbsdf.pndf.smooth import SmoothBeckmann, smooth_alpha
 
+#: Roughness σ_r of the elements that take the place of the manifold under lights. The sun, the
+#: smallest light of a sky, spreads half vectors by a little more. Their lists are built for LISTED.
+LIT_ROUGHNESS, LISTED = 1e-3, 5e-3
+
 #: Roughness σ_r of the elements that replace the manifold while the map carries derivatives. It is
 #: ROUGHNESS times the standard deviation of the map's normals, and at least MIN_ROUGHNESS.
 ROUGHNESS, MIN_ROUGHNESS = 0.1, 1e-3
@@ -58,6 +62,11 @@ class Manifold(TexelMesh, PNDF):
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
     bytes_per_texel = 80.0
+    integrates_lights = True
+
+    #: Elements of the same map, for queries with a light's spread or the half vector's turn; None
+    #: until :meth:`prepare_for_lights`.
+    lit: Elements | None = None
 
     def __init__(
         self,
@@ -74,7 +83,7 @@ class Manifold(TexelMesh, PNDF):
     def build(self, domain: Domain | None = None) -> None:
         """Build the lists for queries within ``domain``, or load them from the cache."""
         self.domain = domain
-        self.lists, self.area, self.stand_in = None, None, None
+        self.lists, self.area, self.stand_in, self.lit = None, None, None, None
         if dr.grad_enabled(self.data):
             spread = float(np.mean(np.var(self.normal_map.normals, axis=(0, 1)))) ** 0.5
             roughness = max(ROUGHNESS * spread, MIN_ROUGHNESS)
@@ -103,6 +112,21 @@ class Manifold(TexelMesh, PNDF):
 
         self.lists = shared(self, make, "lists of quads", self.epsilon, window)
 
+    def prepare_for_lights(self) -> None:
+        """Make the elements that answer queries with a spread or a turn: the manifold's triangles
+        are averaged over them as Gaussians, of which the elements are a mixture."""
+        if self.stand_in is not None:
+            self.stand_in.prepare_for_lights()
+        elif self.lit is None:
+            self.lit = Elements(
+                self.normal_map,
+                LIT_ROUGHNESS,
+                owner=self.owner,
+                domain=self.domain,
+                listed=LISTED,
+            )
+            self.lit.prepare_for_lights()
+
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check new data, and rebuild. Derivatives keep flowing to the data."""
         if keys and "data" not in keys:
@@ -128,7 +152,14 @@ class Manifold(TexelMesh, PNDF):
                     f'{self.owner}: derivatives with respect to "data" need a smooth P-NDF, which '
                     "params.update() makes; it must be called after dr.enable_grad()"
                 )
-            return super().eval(m, query, active)
+            query = Query.of(query)
+            if self.lit is None or not (query.spread or query.turn is not None):
+                return super().eval(m, query, active)
+            lit = query.once("lit", lambda: is_lit(query))
+            seen = self.query_of_stand_in(query)
+            return super().eval(m, query, active & ~lit) + dr.select(
+                lit, self.lit.eval(m, seen, active & lit), 0
+            )
         return self.stand_in.eval(m, self.query_of_stand_in(query), active)
 
     def sample(
@@ -139,7 +170,13 @@ class Manifold(TexelMesh, PNDF):
         active: bool | mi.Bool = True,
     ) -> mi.Vector2f:
         if self.stand_in is None:
-            return super().sample(query, sample1, sample2, active)
+            query = Query.of(query)
+            exact = super().sample(query, sample1, sample2, active)
+            if self.lit is None or not (query.spread or query.turn is not None):
+                return exact
+            lit = query.once("lit", lambda: is_lit(query))
+            seen = self.query_of_stand_in(query)
+            return dr.select(lit, self.lit.sample(seen, sample1, sample2, active & lit), exact)
         return self.stand_in.sample(self.query_of_stand_in(query), sample1, sample2, active)
 
     def query_of_stand_in(self, question: Query | Footprint) -> Query:
@@ -201,5 +238,17 @@ class Manifold(TexelMesh, PNDF):
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
         lists = 0 if self.lists is None else self.lists.nbytes
-        stand_in = {} if self.stand_in is None else self.stand_in.parts()
-        return {**super().parts(), **stand_in, "lists of quads": lists}
+        elements = self.stand_in or self.lit
+        of_elements = {} if elements is None else elements.parts()
+        return {**super().parts(), **of_elements, "lists of quads": lists}
+
+
+def is_lit(query: Query) -> mi.Bool:
+    """Whether the spread of a query, or its turn, is not zero."""
+    lit = mi.Bool(False)
+    for v in query.spread:
+        lit |= dr.any(v != 0)
+    if query.turn is not None:
+        for column in query.turn:
+            lit |= dr.any(column != 0)
+    return lit
