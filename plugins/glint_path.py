@@ -37,8 +37,8 @@ Mitsuba's path tracer, in which glints know the size of a pixel at every bounce.
  * - light_share
    - |string| or |float|
    - Share of a small light's extent that P-NDFs integrate, in [0, 1]; the rest is sampled. 0 is
-     sampling alone. (Default: :monosp:`auto`, which is 1 up to 1024 samples per pixel, and then
-     falls slowly with their number)
+     sampling alone. (Default: :monosp:`auto`. It is 1 for spheres and disks up to 1024 samples per
+     pixel, and then falls slowly with their number. For other shapes it falls from 16 samples on)
 
  * - emitters
    - |string|
@@ -93,10 +93,11 @@ Environments are not small. One of the remaining emitters is chosen in proportio
 :ref:`glint_elements <bsdf-glint_elements>`, :ref:`glint_manifold <bsdf-glint_manifold>`,
 :ref:`glint_filtered <bsdf-glint_filtered>` and :ref:`glint_particles <bsdf-glint_particles>`. A
 light is small if it looks like a disk with a radius of at most 0.5 radians, or like another surface
-with such a variance of directions. This variance is
-split as the pixel's filter is. A share becomes a spread of half vectors, a uniform ellipse, over
-which the P-NDF is averaged in closed form. The rest is sampled, by directions contracted towards
-the light's centre. A share of 1 leaves no noise except that of shadows and textures of the light.
+with such a variance of directions. This variance is split as the pixel's filter is. A share becomes
+a spread of half vectors, a uniform ellipse, over which the P-NDF is averaged in closed form. The
+rest is sampled, by directions contracted towards the light's centre. A share of 1 leaves no noise
+except that of shadows and textures of the light. But it rounds the corners of a rectangle, so for
+other shapes than spheres and disks it falls sooner.
 Visibility and radiance are taken at the sampled points, so shadows and textures keep their mean.
 BSDF sampling then leaves these lights out, and nothing counts twice.
 
@@ -149,7 +150,7 @@ smooth lobe differs from the glints. For BSDFs of your own, see ``glintbsdf.brid
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import drjit as dr
@@ -300,9 +301,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         result.has_differentials = True
         return result, dr.select(same, other, pi)
 
-    def share_of_lights(self, samples: int) -> float:
-        """The share of a light's extent that the P-NDF integrates."""
-        return small.automatic_share(samples) if self.light_share == "auto" else self.light_share
+    def shares_of_lights(self, samples: int) -> tuple[float, float]:
+        """The shares of a light's extent that the P-NDF integrates: of a light that looks like an
+        ellipse, and of any other."""
+        if self.light_share == "auto":
+            return small.automatic_shares(samples)
+        return self.light_share, self.light_share
 
     @dr.syntax
     def sample(
@@ -319,11 +323,12 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             return mi.Spectrum(0), mi.Bool(False), [mi.Float(0) for _ in self.aov_names()]
 
         filters = has_footprints(scene)
-        share = self.share_of_lights(sampler.sample_count()) if filters else 0
-        if share > 0:
+        shares = self.shares_of_lights(sampler.sample_count()) if filters else (0, 0)
+        integrates = shares[0] > 0
+        if integrates:
             prepare_for_lights()
-        lights = SmallLights(scene, self.emitters == "all" and filters, share > 0)
-        light_share = dr.opaque(mi.Float, share) if share > 0 else None
+        lights = SmallLights(scene, self.emitters == "all" and filters, integrates)
+        light_shares = [dr.opaque(mi.Float, share) for share in shares] if integrates else None
         active = mi.Bool(active)
         pi = scene.ray_intersect_preliminary(mi.Ray3f(ray_), coherent=True, active=active)
         ray_, pi = self.to_footprints(scene, ray_, pi, sampler.sample_count(), active)
@@ -366,7 +371,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         while dr.hint(
             active,
             max_iterations=self.max_depth,
-            exclude=[ray_, lights, samples, light_share],
+            exclude=[ray_, lights, samples, light_shares],
             label="glint_path",
         ):
             # The curvature of the surface is what bends ray cones
@@ -408,8 +413,8 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             hit = Hit(scene, si, bsdf, lights)
-            if dr.hint(light_share is not None, mode="scalar"):
-                hit.integrate_lights(curved, cone, light_share)
+            if dr.hint(light_shares is not None, mode="scalar"):
+                hit.integrate_lights(curved, cone, light_shares)
             if dr.hint(self.separate, mode="scalar"):
                 lit = direct_light(
                     hit, sampler, [(bsdf_ctx, active_em & ~seen), (glint_ctx, active_em & seen)]
@@ -424,7 +429,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
 
             sample_1, sample_2 = sampler.next_1d(), sampler.next_2d()
             active_bs = active_next
-            if dr.hint(light_share is not None and not self.separate, mode="scalar"):
+            if dr.hint(light_shares is not None and not self.separate, mode="scalar"):
                 # Skip the sample if the path ends at the next hit and cannot find a light there
                 active_bs &= (depth + 2 < self.max_depth) | ~hit.finds_all_lights()
             bs, bsdf_weight = bsdf.sample(bsdf_ctx, si, sample_1, sample_2, active_bs)
@@ -515,7 +520,7 @@ class Hit:
     """A surface interaction, and how its BSDF is evaluated for the scene's lights.
 
     Attributes:
-        integrates (mi.Bool): whether the BSDF integrates a ``share`` of small lights.
+        integrates (mi.Bool): whether the BSDF integrates a share of small lights.
     """
 
     def __init__(
@@ -526,19 +531,19 @@ class Hit:
         lights: SmallLights,
     ) -> None:
         self.scene, self.si, self.bsdf, self.lights = scene, si, bsdf, lights
-        self.integrates, self.share = mi.Bool(False), None
+        self.integrates, self.shares = mi.Bool(False), None
 
     def integrate_lights(
-        self, curved: mi.SurfaceInteraction3f, cone: RayCone, share: mi.Float
+        self, curved: mi.SurfaceInteraction3f, cone: RayCone, shares: Sequence[mi.Float]
     ) -> None:
         """Let BSDFs that can do so integrate a share of small lights.
 
         Args:
             curved: the interaction with ``dn_du`` and ``dn_dv``, detached.
             cone: the ray cone at the interaction.
-            share: the share of a light's extent to integrate, in (0, 1].
+            shares: see :meth:`GlintPathIntegrator.shares_of_lights`.
         """
-        self.curved, self.share = curved, share
+        self.curved, self.shares = curved, shares
         self.integrates = (self.bsdf.flags() & INTEGRATES_LIGHTS) != 0
         self.turned = cone.turned_per_uv(curved)
 
@@ -553,12 +558,13 @@ class Hit:
         """For a sample of an emitter: the interaction, with the turn of the half vector and the
         spread of the light in it; the direction to evaluate the BSDF for (world space); and whether
         the BSDF integrates the emitter."""
-        if self.share is None:
+        if self.shares is None:
             return self.si, ds.d, mi.Bool(False)
         with dr.suspend_grad():
             si = self.curved
             view = self.lights.view(ds.emitter, si.p, active & self.integrates)
-            variance = dr.select(self.integrates, view.spread(self.share), 0)
+            share = dr.select(view.elliptic, *self.shares)
+            variance = dr.select(self.integrates, view.spread(share), 0)
             d = view.contracted(dr.detach(ds.d), variance)
             far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
             inverse_distance = dr.select(far, 0, dr.rcp(ds.dist))

@@ -32,6 +32,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_collection_finish() -> None:
+    # Modules and tests live to the end of the run. Garbage is collected after every test, and need
+    # not be sought among them.
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "each_variant" in metafunc.fixturenames:
         backend = metafunc.config.getoption("--variant").split("_", 1)[0]

@@ -13,7 +13,7 @@ import pytest
 
 from glintbsdf.core.errors import ParameterError
 from glintbsdf.footprint.pixel_filter import PixelFilter, automatic_share
-from glintbsdf.lights.small import MAX_SAMPLED, SmallLights
+from glintbsdf.lights.small import MAX_SAMPLED, SmallLights, automatic_shares
 from glintbsdf.maps import procedural
 from glintbsdf.scene import passes, rendering
 
@@ -408,6 +408,21 @@ def test_centre_and_variances_of_lights(variant):
         along = (np.array(view.y).ravel()[:, None] * e).sum(0)
         left = (w * along**2).sum() / w.sum() - ((w * along).sum() / w.sum()) ** 2
         assert abs(left + spread.numpy()[0] - view.variance_y.numpy()[0]) < 0.06 * left
+
+
+def test_shares_of_lights_fall(variant):
+    """Of rectangles sooner than of spheres; all is sampled in the end."""
+    plate = {"type": "rectangle", "emitter": {"type": "area"}}
+    scene = glints(a=ball_light((0, 0, 3), 0.2), b={**plate})
+    lights = SmallLights(scene)
+    p = mi.Point3f(0, 0, -9)
+    elliptic = [bool(lights.view(mi.EmitterPtr(e), p).elliptic[0]) for e in scene.emitters()]
+    shapes = [emitter.get_shape().class_name() for emitter in scene.emitters()]
+    assert elliptic == [shape == "Sphere" for shape in shapes] and True in elliptic
+    assert not all(elliptic)
+    shares = np.array([automatic_shares(samples) for samples in (1, 16, 64, 1024, 1 << 20)])
+    assert (shares[:2] == 1).all() and (shares[:4, 0] == 1).all()
+    assert (np.diff(shares[1:, 1]) < 0).all() and (shares[-1] < (0.2, 0.005)).all()
 
 
 def test_lights_without_a_view(variant):
