@@ -88,6 +88,7 @@ from glintbsdf.footprint.domain import Domain
 from glintbsdf.microfacet.frame import above_horizon
 from glintbsdf.pndf.manifold.diffuse import FacetDiffuse, OrenNayarDiffuse
 from glintbsdf.pndf.manifold.mesh import TexelMesh
+from glintbsdf.pndf.sharing import in_turn
 
 METHODS = ("manifold", "oren_nayar")
 
@@ -111,7 +112,7 @@ class GlintDiffuse(FootprintBSDF):
         )
         self.m_components = [self.m_flags]
         if not self.deferred:
-            self.build()
+            in_turn(self.build)
 
     def build(self, domain: Domain | None = None) -> None:
         if self.method_name == "manifold":

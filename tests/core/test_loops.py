@@ -119,6 +119,27 @@ def test_derivative_of_what_is_captured(variant, function, mode):
     assert dr.allclose(derivative, 2 * FACTOR * 2 * 1.5**2 * 0.7)
 
 
+@pytest.mark.parametrize("nested", [False, True])
+def test_variables_may_be_given_other_values_afterwards(variant, nested):
+    """Dr.Jit calls the body again, later, for derivatives."""
+    x = mi.Float(0.7, 0.8)
+    dr.enable_grad(x)
+    factor, turns = mi.Float(3), mi.UInt32(TURNS)
+
+    def term():
+        return factor * dr.square(x)
+
+    def body(k, total):
+        return k + 1, total + (term() if nested else factor * dr.square(x))
+
+    _, total = symbolic_loop(
+        (mi.UInt32(0), mi.Float(0)), lambda k, _: k < turns, body, "a factor that changes"
+    )
+    factor, turns = dr.rcp(total), turns - 1
+    dr.backward(total, flags=dr.ADFlag.ClearInterior)
+    assert dr.allclose(dr.grad(x), 6 * TURNS * x)
+
+
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_narrow_values_in_nested_loops(variant, mode):
     """Three lanes, with a derivative with respect to a value that they share."""

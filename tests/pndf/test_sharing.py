@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from threading import Thread
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from glintbsdf import NormalMap, maps
+from glintbsdf.pndf.sharing import in_turn
 
 #: Plugins, and how to reach what is shared of each.
 STRUCTURES = {
@@ -69,3 +71,44 @@ def test_a_file_that_has_changed_is_another_map(filename, variant):
     assert NormalMap.load(filename) is first is not NormalMap.load(filename, strength=2.0)
     mi.Bitmap(np.full((8, 8, 2), 0.1, np.float32)).write(filename)
     assert NormalMap.load(filename).width == 8
+
+
+def test_builds_take_turns():
+    """One that comes meanwhile, nested or from another thread, is called when the first ends."""
+    log = []
+
+    def first():
+        log.append("first begins")
+        in_turn(lambda: log.append("second"))
+        thread = Thread(target=in_turn, args=[lambda: log.append("third")])
+        thread.start()
+        thread.join()  # it does not wait for its turn
+        log.append("first ends")
+
+    in_turn(first)
+    assert log == ["first begins", "first ends", "second", "third"]
+
+
+def test_a_build_that_fails_keeps_no_other_from_its_turn():
+    log = []
+
+    def fail():
+        in_turn(lambda: log.append("next"))
+        raise ValueError("no map")
+
+    with pytest.raises(ValueError, match="no map"):
+        in_turn(fail)
+    assert log == ["next"]
+
+
+def test_an_interrupted_build_leaves_nothing_to_do():
+    log = []
+
+    def interrupted():
+        in_turn(lambda: log.append("forgotten"))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_turn(interrupted)
+    in_turn(lambda: log.append("later"))
+    assert log == ["later"]

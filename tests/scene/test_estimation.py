@@ -43,6 +43,19 @@ def test_an_estimate_grows_with_the_samples_and_changes_no_image(variant):
     assert after == rendering.render(scene(max_error=0.1, hand_over=0), 4)
 
 
+def test_building_structures_is_not_counted(variant, monkeypatch):
+    """It takes as long for an image of any size."""
+    tile = Tile(0, 0, 5, 8)
+    kernels = [
+        {"size": 40, "execution_time": 3.0},
+        {"size": 1 << 18, "execution_time": 9e6},
+        {"size": 40, "execution_time": 1.0},
+    ]
+    monkeypatch.setattr(estimation.dr, "kernel_history", lambda: kernels)
+    with rendering.Renderer(scene(), 1) as renderer:
+        assert estimation.seconds_of(renderer, tile, 0) == pytest.approx(4e-3)
+
+
 def test_what_cannot_be_tried_has_no_estimate(variant):
     with rendering.Renderer(scene("ptracer"), 1) as renderer:
         assert estimation.estimate(renderer) is None

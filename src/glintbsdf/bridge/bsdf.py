@@ -30,6 +30,7 @@ from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.microfacet.slope_frame import SlopeFrame
 from glintbsdf.pndf.base import PNDF
 from glintbsdf.pndf.displaced import Displaced, DisplacedMasking
+from glintbsdf.pndf.sharing import in_turn
 from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothBeckmann
 
 _alive: WeakSet[FootprintBSDF] = WeakSet()
@@ -389,7 +390,7 @@ class GlintBSDF(FootprintBSDF):
             self.m_components = [flags | INTEGRATES_LIGHTS for flags in self.m_components]
             self.m_flags |= INTEGRATES_LIGHTS
         if not self.deferred:
-            self.build()
+            in_turn(self.build)
         elif self.normal_map is not None:
             alpha = [max(alpha, MIN_ALPHA) for alpha in self.normal_map.roughness()]
             self.smooth = SmoothBeckmann(lambda: mi.Vector2f(*alpha), owner=self.owner)

@@ -5,6 +5,9 @@ derivatives of its state and of arrays in memory that its body gathers from. But
 capture values that are not part of the state, and that were computed in a recorded call. In a BSDF
 inside of an integrator's loop, all values are. Dr.Jit silently drops their derivatives. So
 :func:`symbolic_loop` finds the captured values itself, and makes them part of the state.
+
+And Dr.Jit calls the body again when it differentiates backwards. By then, the function around it
+may have given its variables other values. So the loop keeps those that they had.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str)
     Returns:
         The final state, a tuple like ``state``.
     """
+    condition, body = frozen(condition, {}), frozen(body, {})
     captured = Captured(body)
     width, count = dr.width((*state, *captured.values)), len(state)
     # All values get one width: in nested loops, Dr.Jit cannot sum the derivatives of a narrower
@@ -54,6 +58,25 @@ def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str)
         max_iterations=-1,
         label=label,
     )[:count]
+
+
+def frozen(thing: Any, done: dict) -> Any:
+    """A copy of a function whose enclosing variables keep the values that they have now.
+
+    So do those of the functions that it refers to. Anything but a function is returned as it is.
+    ``done`` maps the identity of each function met so far to its copy.
+    """
+    if type(thing) is partial:
+        return partial(frozen(thing.func, done), *thing.args, **thing.keywords)
+    if type(thing) is not FunctionType or not thing.__closure__:
+        return thing
+    if id(thing) not in done:
+        cells = tuple(CellType() for _ in thing.__closure__)
+        done[id(thing)] = function_with_cells(thing, thing.__defaults__, cells)
+        for cell, former in zip(cells, thing.__closure__, strict=True):
+            if is_set(former):
+                cell.cell_contents = frozen(former.cell_contents, done)
+    return done[id(thing)]
 
 
 def derivatives_exist() -> bool:
@@ -171,13 +194,20 @@ def function_taken_apart(function: FunctionType) -> tuple[list, Callable]:
         defaults, *contents = new
         cell_of = {id(cell): CellType(part) for cell, part in zip(cells, contents, strict=True)}
         closure = tuple(cell_of.get(id(cell), cell) for cell in function.__closure__ or ())
-        result = FunctionType(
-            function.__code__, function.__globals__, function.__name__, defaults, closure
-        )
-        result.__kwdefaults__ = function.__kwdefaults__
-        return result
+        return function_with_cells(function, defaults, closure)
 
     return [function.__defaults__, *(cell.cell_contents for cell in cells)], remade
+
+
+def function_with_cells(
+    function: FunctionType, defaults: tuple | None, closure: tuple
+) -> FunctionType:
+    """A copy of a function with these default arguments and cells of enclosing variables."""
+    result = FunctionType(
+        function.__code__, function.__globals__, function.__name__, defaults, closure
+    )
+    result.__kwdefaults__ = function.__kwdefaults__
+    return result
 
 
 def is_set(cell: CellType) -> bool:

@@ -75,7 +75,11 @@ def column_of(film: Tile, pixels: int) -> Tile:
 
 
 def seconds_of(renderer: rendering.Renderer, tile: Tile, seed: int) -> float:
-    """Seconds that kernels run for one sample in each pixel of a tile."""
+    """Seconds that kernels run for one sample in each pixel of a tile.
+
+    The first sample may find structures unbuilt. Building them does not grow with the image, so
+    only kernels with one lane per pixel count.
+    """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()  # what was before does not count
         passes.sums_of_samples(
@@ -88,4 +92,5 @@ def seconds_of(renderer: rendering.Renderer, tile: Tile, seed: int) -> float:
             seed,
             renderer.shared,
         )
-        return sum(kernel["execution_time"] for kernel in dr.kernel_history()) / 1e3
+        history = dr.kernel_history()
+    return sum(k["execution_time"] for k in history if k["size"] == tile.pixels) / 1e3

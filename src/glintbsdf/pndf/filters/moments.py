@@ -232,6 +232,17 @@ def level_axis(texels: int, spacing: float, periodic: bool) -> SampleAxis:
     return SampleAxis(count, (0.5 - BORDER) * spacing - 0.5, spacing, False)
 
 
+def lanes(count: int) -> tuple[mi.UInt32, mi.Bool]:
+    """Indices of ``count`` samples, and which of them count.
+
+    Dr.Jit writes the index of a single lane into its kernel. So there are at least two; the second
+    of a single sample repeats the first, and does not count.
+    """
+    index = dr.arange(mi.UInt32, max(count, 2))
+    end = opaque(mi.UInt32, count)
+    return dr.minimum(index, end - 1), index < end
+
+
 def smooth(
     channels: list,
     axes: tuple[SampleAxis, SampleAxis],
@@ -250,8 +261,9 @@ def smooth(
         variance (float): variance of the Gaussian, texels².
         spread: see :class:`MomentPyramid`.
     """
+    dr.eval(channels)  # nothing can be evaluated inside of a loop
     source, other = axes[along], axes[1 - along]
-    sample = dr.arange(mi.UInt32, target.count * other.count)
+    sample, _ = lanes(target.count * other.count)
     row, column = (target if along == 1 else other).divided(sample)
     index, kept = (column, row) if along == 1 else (row, column)
 
@@ -262,23 +274,27 @@ def smooth(
     place = dr.fma(mi.Float(index), step, first)
     nearest = floor_int(place + 0.5)
 
-    def sample_at(offset: int) -> list:
+    def sample_at(offset: mi.Int | int) -> list:
         taken = source.wrapped(nearest + offset)
         columns = mi.UInt32((source if along == 1 else other).samples)
         position = kept * columns + taken if along == 1 else taken * columns + kept
         return [dr.gather(mi.Float, channel, position) for channel in channels]
 
     origin = origin_of(sample_at(0), spread)
-    totals, weights = [mi.Float(0) for _ in channels], mi.Float(0)
-    reach = ceil(CUT * sqrt(variance) / source.spacing)
-    for offset in range(-reach, reach + 1):
+    # A loop, as the reach in samples depends on the size of the map.
+    reach = opaque(mi.Int, ceil(CUT * sqrt(variance) / source.spacing))
+
+    def add(offset, weights, *totals):
         distance = mi.Float(nearest + offset) - place
         weight = dr.exp(-sharpness * distance * distance)
-        totals = [
-            dr.fma(weight, value, total)
-            for value, total in zip(about(origin, sample_at(offset), spread), totals, strict=True)
-        ]
-        weights += weight
+        moved = about(origin, sample_at(offset), spread)
+        added = [dr.fma(weight, value, total) for value, total in zip(moved, totals, strict=True)]
+        return offset + 1, weights + weight, *added
+
+    zeros = [dr.zeros(mi.Float, dr.width(sample)) for _ in range(1 + len(channels))]
+    _, weights, *totals = symbolic_loop(
+        (-reach, *zeros), lambda offset, *_: offset <= reach, add, "averages along an axis"
+    )
     return central(origin, [total / weights for total in totals], spread)
 
 
@@ -289,7 +305,7 @@ def texel_normals(
     rows: range,
 ):
     """The normals (``mi.Vector2f``) at some rows of the samples of ``axes``, which are texels."""
-    row, column = axes[1].divided(dr.arange(mi.UInt32, len(rows) * axes[1].count))
+    row, column = axes[1].divided(lanes(len(rows) * axes[1].count)[0])
     row = texels[0].wrapped(mi.Int(row) + opaque(mi.Int, rows.start + int(axes[0].origin)))
     column = texels[1].wrapped(mi.Int(column) + int(axes[1].origin))
     return dr.gather(mi.Vector2f, normals, row * mi.UInt32(texels[1].samples) + column)
@@ -314,7 +330,7 @@ def quad_averages(
     ``over_quad`` computes them from the normals at the corners.
     """
     columns = quad_axes(axes)[1]
-    row, column = columns.divided(dr.arange(mi.UInt32, len(rows) * columns.count))
+    row, column = columns.divided(lanes(len(rows) * columns.count)[0])
     shift = 0 if columns.periodic else 1
     row, column = mi.Int(row) + opaque(mi.Int, rows.start - shift), mi.Int(column) - shift
     corners = [
@@ -617,7 +633,7 @@ class MomentPyramid:
             last = min(top + height, strip.own.stop + shift)
             if first >= last:
                 continue
-            index = dr.arange(mi.UInt32, (last - first) * width)
+            index, active = lanes((last - first) * width)
             begin = opaque(mi.UInt32, self.begin[number] + (first - top) * width)
             # The levels of a small map are stored as they are.
             found = level
@@ -628,7 +644,7 @@ class MomentPyramid:
                 row = row + opaque(mi.UInt32, first - shift - strip.rows.start)
                 source = row * mi.UInt32(columns.samples) + column
                 found = [dr.gather(mi.Float, channel, source) for channel in level]
-            self.records.put(begin + index, found)
+            self.records.put(begin + index, found, active)
 
     def choose_windows(self, domain: Domain | None) -> dict:
         """The part of each level to store: ``(first, number)`` of its rows, and of its columns.

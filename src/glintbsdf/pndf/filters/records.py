@@ -39,14 +39,14 @@ class FloatRecords:
         self.single = dr.zeros(mi.Float, total) if rest else None
         self.nbytes = 4 * total * (4 * groups + rest)
 
-    def put(self, index: mi.UInt32, record: list) -> None:
+    def put(self, index: mi.UInt32, record: list, active: bool | mi.Bool = True) -> None:
         """Store records at their indices, no two at the same one."""
         zero = mi.Float(0)
         for k, group in enumerate(self.groups):
             four = (record[4 * k : 4 * k + 4] + [zero] * 3)[:4]
-            dr.scatter(group, mi.Vector4f(four), index, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(group, mi.Vector4f(four), index, active, dr.ReduceMode.NoConflicts)
         if self.single is not None:
-            dr.scatter(self.single, record[-1], index, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(self.single, record[-1], index, active, dr.ReduceMode.NoConflicts)
         dr.eval(self.groups, self.single)
 
     def get(self, index: mi.UInt32) -> list:
@@ -75,7 +75,7 @@ class PackedRecords:
         self.data = dr.empty(mi.UInt32, total * self.words)
         self.nbytes = 4 * total * self.words
 
-    def put(self, index: mi.UInt32, record: list) -> None:
+    def put(self, index: mi.UInt32, record: list, active: bool | mi.Bool = True) -> None:
         """Store records at their indices, no two at the same one."""
         roots = roots_of(record[self.means :])
         tail = [(half >> shift) & 0xFF for half in map(to_half, roots) for shift in (0, 8)]
@@ -88,7 +88,7 @@ class PackedRecords:
             words[word] = words[word] | (byte << shift)
         for k, word in enumerate(words):
             place = index * self.words + k
-            dr.scatter(self.data, word, place, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(self.data, word, place, active, dr.ReduceMode.NoConflicts)
         dr.eval(self.data)
 
     def get(self, index: mi.UInt32) -> list:

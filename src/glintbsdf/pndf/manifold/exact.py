@@ -61,7 +61,7 @@ class Manifold(TexelMesh, PNDF):
 
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
-    bytes_per_texel = 135.0
+    bytes_per_texel = 80.0
     integrates_lights = True
 
     #: Elements of the same map, for queries with a light's spread or the half vector's turn; None

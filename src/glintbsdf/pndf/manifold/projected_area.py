@@ -60,7 +60,7 @@ from glintbsdf.microfacet.mean_plane import (
     variance_along,
 )
 from glintbsdf.pndf.filters.filters import COVARIANCE
-from glintbsdf.pndf.filters.moments import MomentPyramid
+from glintbsdf.pndf.filters.moments import COARSE, MomentPyramid
 from glintbsdf.pndf.index.lists import every_quad
 from glintbsdf.pndf.manifold.mesh import (
     TexelMesh,
@@ -703,10 +703,9 @@ def variance_of_cells(kernel: TexelKernel, offset, d1, d2):
 #  Approximation by a smooth P-NDF (Eq. 13)
 # ------------------------------------------------------------------------------------------------
 
-#: Footprints that touch at most this many quads use points of the kernel in place of the fit. For a
-#: round Gaussian this is a standard deviation of 1.2 texels; averages over a texel or more do not
-#: resolve smaller ones. For a disk or a box it is 13 texels, as their mean slope differs too much
-#: from the mean slope under a Gaussian.
+#: Footprints that touch at most this many quads use points of the kernel in place of the fit, and
+#: so do those that are narrower than the averages resolve. For a disk or a box the bound is 13
+#: texels, as their mean slope differs too much from the mean slope under a Gaussian.
 FINE_QUADS = {"gaussian": 64, "disk": 1600, "box": 1600}
 
 
@@ -767,6 +766,7 @@ class GgxFit(FootprintArea):
                 over_quad=partial(slopes_of_quad, epsilon=self.mesh.epsilon),
                 spread=COVARIANCE,
                 domain=self.domain,
+                scale=COARSE,
             )
 
         self.pyramid = shared(self.mesh, make, "slopes of quads", self.mesh.epsilon, self.domain)
@@ -774,6 +774,7 @@ class GgxFit(FootprintArea):
     def projected_areas(self, directions, query, active):
         kernel = self.mesh.texel_kernel(query)
         fine = kernel.touched_quads() <= self.few
+        fine |= kernel.minor_variance < COARSE.narrowest(1) ** 2
         by_points = mean_over_points(self.mesh, kernel, directions, active & fine, self.jumps)
         if self.pyramid is None:
             return by_points
