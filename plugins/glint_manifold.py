@@ -103,7 +103,8 @@ derivatives (``dr.enable_grad``, then ``params.update()``), a mixture of element
 :ref:`glint_elements <bsdf-glint_elements>` replaces the manifold. Its elements are half a texel
 apart, and its roughness is a tenth of the standard deviation of the map's normals, at least 0.001.
 :monosp:`threshold` and :monosp:`max_error` then have no effect. Images are a little smoother, and
-their derivatives are correct.
+their derivatives are correct. Where ``glint_path`` integrates lights, elements of roughness 0.001
+answer with derivatives and without, and images stay the same.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from glintbsdf import Footprint
-from glintbsdf.check.derivatives import INTEGRATORS, check_render_derivatives, examples
+from glintbsdf.check.derivatives import (
+    INTEGRATORS,
+    check_render_derivatives,
+    examples,
+    render_derivatives,
+)
 from glintbsdf.check.suite import View
 from glintbsdf.pndf import Flakes, Grid
 
@@ -52,6 +57,14 @@ def test_derivatives_in_symbolic_integrators(variant, integrator):
     check_render_derivatives(
         plate, ["sigma_r", "data"], integrator, lamp="sphere", spp=64, resolution=0.3
     )
+
+
+def test_the_manifold_under_integrated_lights(variant):
+    """Elements answer with derivatives and without: the images are those of the differences."""
+    plate, keys, settings = examples()["manifold, map"]
+    settings = {**settings, "lamp": "sphere", "spp": 64}
+    (derivative,) = render_derivatives(plate, keys, "glint_path", **settings)
+    assert derivative.right and derivative.noise < 0.01 * abs(derivative.difference), derivative
 
 
 @pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])

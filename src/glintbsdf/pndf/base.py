@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.alignment import aligned
 from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.memory import check_room
 from glintbsdf.footprint.domain import Domain
@@ -263,6 +264,21 @@ class PNDF(ABC):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check the parameters ``keys``, or all if empty, and rebuild structures that depend on
         them."""
+
+
+def changed_map(data: mi.TensorXf, wrap_mode: str, owner: str) -> NormalMap:
+    """The map of projected normals (H×W×2) that a user has set.
+
+    Values that come from NumPy move to memory that begins at a cache line, see :func:`~.stored`.
+    Values with derivatives are computed, and are in such memory.
+
+    Raises:
+        ParameterError: the values are no map.
+    """
+    values = aligned(data.numpy().copy())  # what numpy() returns goes with the former values
+    if not dr.grad_enabled(data):
+        mi.set_property(data, type(data)(values))  # in place, as the scene's parameters refer to it
+    return NormalMap(values, wrap_mode, owner, "data")
 
 
 def map_alpha_squared(data: mi.TensorXf) -> mi.Vector2f:

@@ -41,7 +41,7 @@ from glintbsdf.microfacet.mean_plane import (
     slope_of,
     variance_along,
 )
-from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.base import PNDF, changed_map, register
 from glintbsdf.pndf.elements.levels import Levels
 from glintbsdf.pndf.filters.filters import COVARIANCE
 from glintbsdf.pndf.filters.moments import COARSE, MomentPyramid
@@ -849,7 +849,7 @@ class Elements(Mixture):
         if keys and not {"data", "sigma_r"} & set(keys):
             return
         check_sigma_r(self.owner, self.sigma_r[0])
-        self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+        self.normal_map = changed_map(self.data, self.wrap_mode, self.owner)
         self.changed = True
         self.build(self.domain)
 

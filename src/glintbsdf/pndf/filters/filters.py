@@ -28,7 +28,7 @@ from glintbsdf.maps.normalmap import MAX_SLOPE, NormalMap, check_texels, map_byt
 from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.microfacet.mean_plane import mean_plane_area, visibility
 from glintbsdf.microfacet.slope_distribution import DISTRIBUTIONS, SlopeLobe
-from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.base import PNDF, changed_map, register
 from glintbsdf.pndf.filters.moments import MomentPyramid, Spread
 from glintbsdf.pndf.gaussian_elements import AveragedGaussian, Gaussian, point_of_ellipse
 from glintbsdf.pndf.sharing import shared
@@ -409,7 +409,7 @@ class Filtered(PNDF):
         """Check what has changed, and rebuild. Derivatives keep flowing to the parameters."""
         self.check_alpha()
         if not keys or "data" in keys:
-            self.normal_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+            self.normal_map = changed_map(self.data, self.wrap_mode, self.owner)
             self.changed = True
             self.build(self.domain)
 

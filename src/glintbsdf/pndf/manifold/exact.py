@@ -53,7 +53,8 @@ class Manifold(TexelMesh, PNDF):
     ``data`` carry derivatives, a mixture of :class:`~.Elements` of the same map replaces the
     manifold, in evaluation and in sampling. Its roughness is small, see :data:`ROUGHNESS`. The
     mixture is smooth, and its elements follow the same triangles. Averages of D over more than this
-    roughness have the same derivatives as averages of the mixture.
+    roughness have the same derivatives as averages of the mixture. Where lights are integrated,
+    their extent makes D smooth, and elements answer with derivatives and without.
     """
 
     normal_map: NormalMap
@@ -64,8 +65,8 @@ class Manifold(TexelMesh, PNDF):
     bytes_per_texel = 80.0
     integrates_lights = True
 
-    #: Elements of the same map, for queries with a light's spread or the half vector's turn; None
-    #: until :meth:`prepare_for_lights`.
+    #: Elements of the same map, for queries with a light's spread or the half vector's turn, with
+    #: derivatives or without; None until :meth:`prepare_for_lights`.
     lit: Elements | None = None
 
     def __init__(
@@ -115,14 +116,15 @@ class Manifold(TexelMesh, PNDF):
     def prepare_for_lights(self) -> None:
         """Make the elements that answer queries with a spread or a turn: the manifold's triangles
         are averaged over them as Gaussians, of which the elements are a mixture."""
-        if self.stand_in is not None:
-            self.stand_in.prepare_for_lights()
-        elif self.lit is None:
+        if self.lit is not None:
+            return
+        with dr.resume_grad():  # an integrator may ask while it suspends derivatives
             self.lit = Elements(
                 self.normal_map,
                 LIT_ROUGHNESS,
                 owner=self.owner,
                 domain=self.domain,
+                data=None if self.stand_in is None else self.data,
                 listed=LISTED,
             )
             self.lit.prepare_for_lights()
@@ -146,21 +148,18 @@ class Manifold(TexelMesh, PNDF):
     def eval(
         self, m: mi.Vector2f, query: Query | Footprint, active: bool | mi.Bool = True
     ) -> mi.Float:
-        if self.stand_in is None:
-            if dr.grad_enabled(self.data):
-                raise RuntimeError(
-                    f'{self.owner}: derivatives with respect to "data" need a smooth P-NDF, which '
-                    "params.update() makes; it must be called after dr.enable_grad()"
-                )
-            query = Query.of(query)
-            if self.lit is None or not (query.spread or query.turn is not None):
-                return super().eval(m, query, active)
-            lit = query.once("lit", lambda: is_lit(query))
-            seen = self.query_of_stand_in(query)
-            return super().eval(m, query, active & ~lit) + dr.select(
-                lit, self.lit.eval(m, seen, active & lit), 0
+        if self.stand_in is None and dr.grad_enabled(self.data):
+            raise RuntimeError(
+                f'{self.owner}: derivatives with respect to "data" need a smooth P-NDF, which '
+                "params.update() makes; it must be called after dr.enable_grad()"
             )
-        return self.stand_in.eval(m, self.query_of_stand_in(query), active)
+        query = Query.of(query)
+        if self.lit is None or not (query.spread or query.turn is not None):
+            return self.eval_unlit(m, query, active)
+        lit = query.once("lit", lambda: is_lit(query))
+        return self.eval_unlit(m, query, active & ~lit) + dr.select(
+            lit, self.lit.eval(m, self.query_of_elements(query), active & lit), 0
+        )
 
     def sample(
         self,
@@ -169,24 +168,36 @@ class Manifold(TexelMesh, PNDF):
         sample2: mi.Point2f,
         active: bool | mi.Bool = True,
     ) -> mi.Vector2f:
-        if self.stand_in is None:
-            query = Query.of(query)
-            exact = super().sample(query, sample1, sample2, active)
-            if self.lit is None or not (query.spread or query.turn is not None):
-                return exact
-            lit = query.once("lit", lambda: is_lit(query))
-            seen = self.query_of_stand_in(query)
-            return dr.select(lit, self.lit.sample(seen, sample1, sample2, active & lit), exact)
-        return self.stand_in.sample(self.query_of_stand_in(query), sample1, sample2, active)
+        query = Query.of(query)
+        unlit = self.sample_unlit(query, sample1, sample2, active)
+        if self.lit is None or not (query.spread or query.turn is not None):
+            return unlit
+        lit = query.once("lit", lambda: is_lit(query))
+        seen = self.query_of_elements(query)
+        return dr.select(lit, self.lit.sample(seen, sample1, sample2, active & lit), unlit)
 
-    def query_of_stand_in(self, question: Query | Footprint) -> Query:
+    def eval_unlit(self, m: mi.Vector2f, query: Query, active: bool | mi.Bool) -> mi.Float:
+        """D(m) for queries without a spread or a turn."""
+        if self.stand_in is None:
+            return super().eval(m, query, active)
+        return self.stand_in.eval(m, self.query_of_elements(query), active)
+
+    def sample_unlit(
+        self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: bool | mi.Bool
+    ) -> mi.Vector2f:
+        """Draw a projected normal with the density :meth:`eval_unlit`."""
+        if self.stand_in is None:
+            return super().sample(query, sample1, sample2, active)
+        return self.stand_in.sample(self.query_of_elements(query), sample1, sample2, active)
+
+    def query_of_elements(self, question: Query | Footprint) -> Query:
         """The query with a narrower footprint: the Gaussian with the variance of this kernel."""
         query = Query.of(question)
 
         def narrowed() -> Query:
             return query.at(gaussian_like(self.kernel, query.footprint))
 
-        return query.once(("stand-in", self.kernel), narrowed)
+        return query.once(("elements", self.kernel), narrowed)
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float:
         """D(m), the density of projected normals over the unit disk (Eq. 5); 0 outside of it."""
@@ -237,10 +248,12 @@ class Manifold(TexelMesh, PNDF):
 
     def parts(self) -> dict[str, int]:
         """Memory of each part of the structure, bytes."""
-        lists = 0 if self.lists is None else self.lists.nbytes
-        elements = self.stand_in or self.lit
-        of_elements = {} if elements is None else elements.parts()
-        return {**super().parts(), **of_elements, "lists of quads": lists}
+        parts = super().parts()
+        for purpose, elements in (("derivatives", self.stand_in), ("lights", self.lit)):
+            if elements is not None:
+                own = elements.parts().items()
+                parts |= {f"{name} for {purpose}": size for name, size in own if name != "map"}
+        return {**parts, "lists of quads": 0 if self.lists is None else self.lists.nbytes}
 
 
 def is_lit(query: Query) -> mi.Bool:

@@ -22,6 +22,7 @@ from glintbsdf.footprint.kernels import KERNELS, TexelKernel
 from glintbsdf.footprint.lattice import Lattice, floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import NormalMap, map_bytes
+from glintbsdf.pndf.base import changed_map
 
 
 def cross(a, b):
@@ -267,7 +268,7 @@ class TexelMesh:
             return
         self.changed = True
         wrap_mode = self.normal_map.wrap_mode
-        self.normal_map = NormalMap(self.data.numpy(), wrap_mode, self.owner, "data")
+        self.normal_map = changed_map(self.data, wrap_mode, self.owner)
         self.make_vertices()
 
     def parts(self) -> dict[str, int]:

@@ -32,7 +32,7 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap, map_bytes
 from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
 from glintbsdf.microfacet.mean_plane import choose_areas
-from glintbsdf.pndf.base import register
+from glintbsdf.pndf.base import changed_map, register
 from glintbsdf.pndf.elements.elements import Elements, check_sigma_r
 from glintbsdf.pndf.manifold.projected_area import mean_over_points
 from glintbsdf.pndf.mip import tables
@@ -242,7 +242,7 @@ class Patches(Elements):
         """Check what has changed; a new sample makes everything anew."""
         check_sigma_r(self.owner, self.sigma_r[0])
         if not keys or "data" in keys:
-            self.sample_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+            self.sample_map = changed_map(self.data, self.wrap_mode, self.owner)
         self.build()
 
     @property

@@ -33,7 +33,7 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap, map_bytes
 from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
 from glintbsdf.microfacet.mean_plane import lobe_area, slope_of
-from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.base import PNDF, changed_map, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
 from glintbsdf.pndf.manifold.mesh import add_where, where_needed
@@ -457,7 +457,7 @@ class Mip(PNDF):
         """Check what has changed; a new sample makes everything anew."""
         check_sigma_r(self.owner, self.sigma_r[0])
         if not keys or "data" in keys:
-            self.sample_map = NormalMap(self.data.numpy(), self.wrap_mode, self.owner, "data")
+            self.sample_map = changed_map(self.data, self.wrap_mode, self.owner)
             self.build()
 
     def smooth(self) -> SmoothBeckmann:
