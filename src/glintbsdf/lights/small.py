@@ -9,19 +9,16 @@ taken at the points themselves. So a light that is textured, or partly hidden, k
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.lights.regions import BrightRegions, find_regions, samples_of
+from glintbsdf.lights.view import MAX_DEVIATION, View
+
 #: Largest number of emitters that are sampled at every hit: the most powerful ones. Of the others,
 #: one is chosen at random.
 MAX_SAMPLED = 16
-
-#: A light is small if the standard deviation of the directions to it (radians) is at most this: a
-#: disk with a radius of 0.5 radians. Larger lights are sampled by the emitter and by the BSDF.
-MAX_DEVIATION = 0.25
 
 #: With at most this many emitters, it is worth checking all of them to save a BSDF sample.
 MAX_CHECKED = 8
@@ -58,44 +55,6 @@ def automatic_shares(samples: int) -> tuple[float, float]:
     return min(1.0, elliptic), min(1.0, (PREVIEW_SAMPLES / samples) ** 0.5)
 
 
-@dataclass
-class View:
-    """A light as it is seen from a point.
-
-    Attributes:
-        d (mi.Vector3f): unit direction to its centre.
-        x, y (mi.Vector3f): unit vectors perpendicular to d, the principal axes of the directions to
-            the light.
-        variance_x, variance_y (mi.Float): variances of these directions along x and y, radians².
-        small (mi.Bool): whether the light has extent, and both variances are below the square of
-            :data:`MAX_DEVIATION`.
-        elliptic (mi.Bool): whether it looks like a uniform ellipse.
-    """
-
-    d: mi.Vector3f
-    x: mi.Vector3f
-    y: mi.Vector3f
-    variance_x: mi.Float
-    variance_y: mi.Float
-    small: mi.Bool
-    elliptic: mi.Bool
-
-    def spread(self, share: mi.Float) -> mi.Float:
-        """The isotropic variance (radians²) that the BSDF integrates: the ``share`` of the smaller
-        variance of the light. It is 0 for a light that is not small."""
-        return dr.select(self.small, share * dr.minimum(self.variance_x, self.variance_y), 0)
-
-    def contracted(self, d: mi.Vector3f, spread: mi.Float) -> mi.Vector3f:
-        """The direction ``d`` to a point of the light, contracted towards the centre, so that the
-        variance of directions is smaller by ``spread`` (radians²)."""
-        offset = d - self.d
-        x, y = dr.dot(offset, self.x), dr.dot(offset, self.y)
-        for axis, along, variance in ((self.x, x, self.variance_x), (self.y, y, self.variance_y)):
-            factor = dr.safe_sqrt(1 - spread / dr.maximum(variance, 1e-20))
-            offset = offset + axis * (along * (factor - 1))
-        return dr.select(spread > 0, dr.normalize(self.d + offset), d)
-
-
 class SmallLights:
     """The emitters of a scene, and how they are sampled.
 
@@ -104,12 +63,15 @@ class SmallLights:
         every (bool): whether up to :data:`MAX_SAMPLED` emitters are sampled at every hit; otherwise
             none is.
         extents (bool): whether to measure the extents of lights; otherwise none counts as small.
+            With both, bright regions of an environment count as lights.
 
     Attributes:
         sampled (mi.EmitterPtr): the ``sampled_count`` emitters that are sampled at every hit.
         others (mi.EmitterPtr): the ``others_count`` emitters of which one is chosen, in proportion
             to its ``sampling_weight``.
         probability (mi.Float): probability to be sampled at a hit, by :meth:`registry_index`.
+        regions (BrightRegions): bright regions of the environment, which BSDFs that integrate
+            lights are to see apart from the rest of it; None if there are none.
     """
 
     def __init__(self, scene: mi.Scene, every: bool = True, extents: bool = True) -> None:
@@ -157,6 +119,51 @@ class SmallLights:
         )
         self.centre = mi.Float(centre.ravel())
         self.axes = mi.Float(axes.ravel())
+        self.regions = None
+        for k, emitter in enumerate(emitters):
+            if every and extents and emitter.is_environment() and weights[k]:
+                found = find_regions(*samples_of(emitter))
+                if found:
+                    self.regions = BrightRegions(scene, chosen([k]), found)
+
+    def is_cut(self, emitter: mi.EmitterPtr) -> mi.Bool:
+        """Whether an emitter is an environment of which regions are cut out."""
+        return mi.Bool(False) if self.regions is None else emitter == self.regions.environment
+
+    def in_region(self, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
+        """Whether ``ds`` is a direction to a bright region of the environment."""
+        if self.regions is None:
+            return mi.Bool(False)
+        return self.regions.contain(ds.d, active & self.is_cut(ds.emitter))
+
+    def count_sampled(self, integrated: mi.Bool) -> mi.UInt32:
+        """Number of lights that are sampled at every hit, where BSDFs integrate lights or not."""
+        count = dr.opaque(mi.UInt32, self.sampled_count)
+        if self.regions is None:
+            return count
+        return count + dr.select(integrated, self.regions.count, 0)
+
+    def sample_direction(
+        self, k: mi.UInt32, it: mi.Interaction3f, random: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, View]:
+        """Sample light ``k`` of those that are sampled at every hit: the emitters ``sampled``, then
+        the regions of the environment. Returns what ``mi.Emitter.sample_direction`` does, and the
+        view of the light from ``it``."""
+        found = None
+        if self.sampled_count > 0:
+            of_emitter = active & (k < dr.opaque(mi.UInt32, self.sampled_count))
+            emitter = dr.gather(mi.EmitterPtr, self.sampled, k, of_emitter)
+            ds, weight = emitter.sample_direction(it, random, of_emitter)
+            ds.emitter = emitter
+            with dr.suspend_grad():
+                found = ds, weight, self.view(emitter, it.p, of_emitter)
+        if self.regions is not None:
+            region = k - dr.opaque(mi.UInt32, self.sampled_count)
+            of_region = active if found is None else active & ~of_emitter
+            sampled = self.regions.sample_direction(region, it, random, of_region)
+            sampled = *sampled, self.regions.view(region, of_region)
+            found = sampled if found is None else dr.select(of_region, sampled, found)
+        return found
 
     def all_small(self, p: mi.Point3f) -> mi.Bool:
         """Whether all emitters are points, or small as seen from ``p``, so that none of them needs
