@@ -32,7 +32,8 @@ Mitsuba's path tracer, in which glints know the size of a pixel at every bounce.
    - |string| or |float|
    - Share of the pixel filter's variance that footprints carry, in [0, 1]; they are placed with the
      rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 for a
-     single sample per pixel, and falls slowly with their number)
+     single sample per pixel, and falls slowly with their number; with a :monosp:`box` filter it
+     falls from 4 samples on, and faster)
 
  * - light_share
    - |string| or |float|
@@ -257,7 +258,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         if not able or (automatic and not has_footprints(scene)):
             yield None
             return
-        share = automatic_share(samples) if automatic else self.pixel_share
+        share = self.pixel_share
+        if automatic:
+            share = automatic_share(samples, pixel_filter.abrupt)
         self.pixels_per_differential = (share * pixel_filter.variance) ** 0.5 / PIXEL_SIGMA
         self.shared = SharedFilter(pixel_filter, (1 - share) ** 0.5)
         try:

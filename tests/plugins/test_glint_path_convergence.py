@@ -205,9 +205,15 @@ def test_one_sample_of_the_whole_filter_has_no_noise(variant):
     assert np.allclose(found[0], found[1], rtol=1e-4, atol=1e-5 * found.max())
 
 
-def test_shares():
-    shares = [automatic_share(n) for n in (1, 4, 16, 1024)]
-    assert shares[0] == 1 and shares == sorted(shares, reverse=True) and shares[-1] > 0.05
+@pytest.mark.parametrize("abrupt", [False, True])
+def test_shares(abrupt):
+    shares = [automatic_share(n, abrupt) for n in (1, 4, 16, 1024)]
+    assert shares[0] == 1 and shares == sorted(shares, reverse=True) and shares[-1] > 1e-3
+
+
+@pytest.mark.parametrize("name", ["gaussian", "box", "tent", "mitchell"])
+def test_a_box_ends_abruptly(variant, name):
+    assert PixelFilter(mi.load_dict({"type": name})).abrupt == (name == "box")
 
 
 @pytest.mark.parametrize("name", ["pixel_share", "light_share"])

@@ -32,13 +32,16 @@ PIXEL_SIGMA = 0.5
 LEAST_VARIANCE = 1e-3
 
 
-def automatic_share(samples: int) -> float:
+def automatic_share(samples: int, abrupt: bool) -> float:
     """The share a of footprints where an image takes ``samples`` samples per pixel, in (0, 1].
 
     Footprints are an approximation, and what they leave out of a pixel counts less the smaller they
     are: a falls with the number of samples, so slowly that the samples' noise falls as before.
+    Footprints reach beyond the ends of an ``abrupt`` filter, see :class:`PixelFilter`. There the
+    share falls as fast as the noise: of the shares tried on a ball under small lights it has the
+    smallest error at 4, 16 and 64 samples.
     """
-    return float(samples) ** -0.125
+    return min(1.0, 4 / samples) if abrupt else float(samples) ** -0.125
 
 
 class PixelFilter:
@@ -53,6 +56,7 @@ class PixelFilter:
         weight (float): ∫f dx / ∫|f| dx, the mean of the signs that :meth:`sample` returns for one
             axis.
         positive (bool): whether the profile is nowhere negative.
+        abrupt (bool): whether the profile drops to zero at its ends, as a box does.
     """
 
     def __init__(self, rfilter: mi.ReconstructionFilter) -> None:
@@ -65,6 +69,7 @@ class PixelFilter:
         self.variance = float(np.trapezoid(profile * x * x, dx=step) / mass)
         self.weight = float(mass / total)
         self.positive = bool(np.all(profile >= 0))
+        self.abrupt = bool(abs(profile[-1]) > 0.1 * profile.max())
         self.rfilter = rfilter
         self.distribution = mi.ContinuousDistribution(
             mi.ScalarVector2f(-radius, radius),
