@@ -196,8 +196,7 @@ class GlintGrid(GlintBSDF):
             "seed": parameters.whole("seed", 0),
             "owner": self.owner,
         }
-        # There is no structure that would have to be deferred.
-        self.build()
+        self.finish(Grid)
 
     def create(self, domain: Domain | None) -> Grid:
         return Grid(**self.options)

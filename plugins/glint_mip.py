@@ -219,7 +219,7 @@ class GlintMip(GlintBSDF):
         max_error = parameters.number("max_error", 0.05)
         self.options |= lobes if self.kind is Mip else {"max_error": max_error}
         self.masking_name = parameters.choice("masking", Mip.maskings[0], Mip.maskings)
-        self.finish()
+        self.finish(self.kind)
 
     def create(self, domain: Domain | None) -> PNDF:
         return self.kind(self.normal_map, **self.options)

@@ -22,8 +22,8 @@ class BlendedCells(CoveredCells):
     """Both grids without coherence: each level is shifted by a different distance."""
 
     def sum(self, term, zero, active):
-        def moved(x, y, level, active):
-            return term(x + level * 1_000_003, y - level * 999_983, level, active)
+        def moved(x, y, level, *rest):
+            return term(x + level * 1_000_003, y - level * 999_983, level, *rest)
 
         return super().sum(moved, zero, active)
 
@@ -35,7 +35,7 @@ class SingleCell(CoveredCells):
         level = dr.select(self.blend < 0.5, self.level, self.level + 1)
         centre = self.centre * dr.exp2(-mi.Float(level))
         cell = self.swapped(mi.Vector2i(dr.round(centre)))
-        return zero + term(cell.x, cell.y, level, active)
+        return zero + term(cell.x, cell.y, level, active, mi.Float(0))
 
 
 PARTICLES = "particles"

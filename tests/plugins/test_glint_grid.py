@@ -135,7 +135,7 @@ def test_weights_are_a_partition_about_the_centre(variant, stretch):
     footprint.uv = footprint.uv / 100  # sums of small coordinates lose few digits
     cells = covered(footprint, stretch)
 
-    def moments(x, y, level, active):
+    def moments(x, y, level, active, along):
         spacing = dr.exp2(mi.Float(level))
         return dr.select(active, mi.Vector3f(1, mi.Float(x) * spacing, mi.Float(y) * spacing), 0)
 

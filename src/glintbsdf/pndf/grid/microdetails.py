@@ -7,6 +7,9 @@ integers make everything. The functions follow the paper's order and use its sym
 depart from the paper, they say so. Section 4.1, the coherent hash, is
 :func:`~glintbsdf.core.hashing.coherent_vertex`; Listing 1 is in :class:`Grid`.
 
+Lights of some extent, and half vectors that turn over the footprint, go beyond the paper:
+:mod:`glintbsdf.pndf.grid.ellipse`.
+
 A slope is ``x = m_xy / m_z`` of a unit normal m; α = √2 σ is a Beckmann roughness. The subscript g
 is for the whole surface (global), l for one microdetail (local), and m for the centres of the
 microdetails (mesoscale).
@@ -27,6 +30,7 @@ from glintbsdf.footprint.gaussian import is_literal_zero
 from glintbsdf.footprint.lattice import floor_int
 from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.base import PNDF, register
+from glintbsdf.pndf.grid.ellipse import EllipseOfCells
 from glintbsdf.pndf.smooth import SmoothBeckmann
 
 #: Level of the coarsest grid: its cells are 2⁴⁰ times as wide as cells of the finest grid. They
@@ -100,6 +104,9 @@ class CoveredCells:
     Attributes:
         level (mi.Int): level of the finer grid: its cells are 2^level times as wide as the finest.
         blend (mi.Float): weight of the coarser grid, in [0, 1).
+        major, minor (mi.Vector2f): two axes of the footprint (UV), those of its ellipse in
+            stretched coordinates; the median goes along the major one.
+        walked (mi.Float): length of the median, relative to the major axis.
     """
 
     def __init__(self, footprint, scale, stretch, max_anisotropy) -> None:
@@ -119,17 +126,31 @@ class CoveredCells:
         self.blend = dr.log2(size * power_of_two(-self.level))
 
         # The median, in stretched coordinates: p along it and q across, q = slope · p
-        a, b, c = covariance(du * stretch, dv * stretch)
+        du, dv = du * stretch, dv * stretch
+        a, b, c = covariance(du, dv)
         squared_major = larger_eigenvalue(a, b, c)
         self.along_x = a >= c
         rise = squared_major - dr.minimum(a, c)
         self.slope = dr.select(rise > 0, b / dr.select(rise > 0, rise, 1), 0)
         half = dr.maximum(dr.sqrt(squared_major) - SHORTENING * size, 0)
         self.half = half * dr.rsqrt(1 + dr.square(self.slope))
+        self.walked = dr.select(squared_major > 0, half * dr.rsqrt(squared_major), 0)
+        self.major, self.minor = self.principal(footprint, du, dv)
         self.centre = self.swapped(footprint.uv * scale * stretch)
 
         # With a stretch of 0 along one axis, all vertices lie on a line
         self.rows = 1 if any(is_literal_zero(s) for s in stretch) else 2
+
+    def principal(self, footprint, du, dv) -> tuple[mi.Vector2f, mi.Vector2f]:
+        """:attr:`major` and :attr:`minor`; ``du``, ``dv``: stretched axes of the footprint."""
+        difference = dr.squared_norm(du) - dr.squared_norm(dv)
+        sine, cosine = dr.sincos(0.5 * dr.atan2(2 * dr.dot(du, dv), difference))
+        along = self.swapped(du * cosine + dv * sine).x
+        sign = dr.select(along < 0, -1, 1)
+        return (
+            sign * (footprint.du * cosine + footprint.dv * sine),
+            footprint.dv * cosine - footprint.du * sine,
+        )
 
     def swapped(self, v):
         """(p, q) from (x, y), and back."""
@@ -161,9 +182,10 @@ class CoveredCells:
         )
 
     def sum(self, term, zero, active):
-        """Σ weight · term(x, y, level, active) over all vertices (x, y) of both grids.
+        """Σ weight · term(x, y, level, active, along) over all vertices (x, y) of both grids.
 
-        ``zero`` is the empty sum; ``term`` must return a value of its type.
+        ``along``: where a vertex is seen on the median, from −1 to 1. ``zero`` is the empty sum;
+        ``term`` must return a value of its type.
         """
         grids = self.grid(self.level, 1 - self.blend), self.grid(self.level + 1, self.blend)
         finer_columns, coarser_columns = (grid[-1] for grid in grids)
@@ -177,14 +199,17 @@ class CoveredCells:
             x = mi.Float(i)
             weight = weight * (tent_integral(p + half - x) - tent_integral(p - half - x))
             weight = weight / (2 * half)
-            y = q + self.slope * (dr.clip(x, p - half, p + half) - p)
+            along = dr.clip(x, p - half, p + half) - p
+            y, along = q + self.slope * along, along / half
             row = dr.floor(y)
             fraction = y - row
             row = q0 + mi.Int(row)
             weights = (weight * (1 - fraction), weight * fraction) if self.rows == 2 else (weight,)
             for j, share in enumerate(weights):
                 vertex = self.swapped(mi.Vector2i(p0 + i, row + j))
-                total = total + share * term(vertex.x, vertex.y, level, active & (share > 0))
+                total = total + share * term(
+                    vertex.x, vertex.y, level, active & (share > 0), along
+                )
             return step + 1, total
 
         end = finer_columns + coarser_columns
@@ -321,6 +346,21 @@ class ReflectingCount:
 # ------------------------------------------------------------------------------------------------
 
 
+class Vertex:
+    """The random numbers of a vertex of a grid.
+
+    Attributes:
+        level (mi.Int): of the grid.
+        shift (mi.Vector2f): of the grid of half vectors, in cells.
+        bits (mi.UInt32): seed of its counts.
+    """
+
+    def __init__(self, x: mi.Int, y: mi.Int, level: mi.Int, seed: mi.UInt32) -> None:
+        x, y, name = coherent_vertex(x, y, level)
+        a, b, self.bits = pcg3d(x, y, name + seed)
+        self.level, self.shift = level, mi.Vector2f(uniform(a), uniform(b))
+
+
 def check_ranges(values: dict[str, float], owner: str) -> None:
     """Raise :class:`~.ParameterError` unless all numeric parameters of :class:`Grid` are in
     range."""
@@ -380,6 +420,7 @@ class Grid(PNDF):
         ParameterError: a parameter is out of range.
     """
 
+    integrates_lights = True
     maskings = ("beckmann",)
     roughness_keys = ("alpha_u", "alpha_v")
 
@@ -496,52 +537,109 @@ class Grid(PNDF):
 
     def _eval(self, m: mi.Vector2f, query: Query, active: mi.Bool) -> mi.Float | mi.Color3f:
         """D(m) over the disk of projected normals, in colour where there are ``colors``."""
+        cells = self.cells(query)
+        if query.spread or query.turn is not None:
+            return self.averaged(m, query, cells, active)
+        density, x, cos_theta, active = self.mean_density(m, active)
+        with dr.suspend_grad():
+            p = self.reflecting_share(x)
+            active &= p > dr.smallest(mi.Float)
+            hp = paraboloid_map(x, cos_theta) * self.cells_per_unit
+            binomial = ReflectingCount(p)
+
+        def fraction(x, y, level, active, along):
+            vertex = Vertex(x, y, level, self.seed)
+            # Line 12: quantise the half vector; the grid of half vectors is shifted in each cell
+            cell = mi.Vector2i(dr.floor(hp + vertex.shift))
+            return self.fraction(vertex, cell, binomial, active)
+
+        noise = cells.sum(fraction, self.zero(), active) / dr.select(active, p, 1)
+        return dr.select(active, density * noise, 0)
+
+    def averaged(self, m, query: Query, cells: CoveredCells, active) -> mi.Float | mi.Color3f:
+        """D(m) averaged over the ellipse of the light's spread, and over the half vector's turn.
+
+        Along the footprint's median the half vector turns from vertex to vertex. Elsewhere a vertex
+        does not tell where in the footprint its microdetails are: this part of the turn widens the
+        ellipse.
+        """
+        turn, spread = query.turn, query.spread
+        active = active & (dr.squared_norm(m) < 1)
+        m = dr.select(active, m, 0)
+        with dr.suspend_grad():
+            if turn is not None:
+                # A segment has the variance of a third of its half length squared
+                turned = sqrt(3) * (turn @ (cells.major * cells.walked))
+                left = dr.safe_sqrt(1 - dr.square(cells.walked))
+                spread = (*spread, turn @ (cells.major * left), turn @ cells.minor)
+            ellipse = EllipseOfCells(m, spread, self.cells_per_unit)
+
+        def at_vertex(x, y, level, active, along):
+            vertex = Vertex(x, y, level, self.seed)
+
+            def at_normal(x, y, m, active):
+                density, slope, _, active = self.mean_density(m, active)
+                with dr.suspend_grad():
+                    p = self.reflecting_share(slope)
+                    active &= p > dr.smallest(mi.Float)
+                    binomial = ReflectingCount(dr.select(active, p, 0.5))
+                    noise = self.fraction(vertex, mi.Vector2i(x, y), binomial, active)
+                    noise = noise / dr.select(active, p, 1)
+                    noise = dr.fma(ellipse.beta, noise - self.mean_color(), self.mean_color())
+                return dr.select(active, density * noise, 0)
+
+            seen = m if turn is None else m + turned * along
+            return ellipse.sum(seen, vertex.shift, at_normal, self.zero(), active)
+
+        return dr.select(active, cells.sum(at_vertex, self.zero(), active), 0)
+
+    def mean_density(self, m: mi.Vector2f, active: mi.Bool) -> tuple:
+        """``(D_g(m), slope, cosθ, active)``: the mean over all places, and where m is above the
+        horizon."""
         squared_z = 1 - dr.squared_norm(m)
         active = active & (squared_z > 1e-8)
         cos_theta = dr.sqrt(dr.select(active, squared_z, 1))
         x = dr.select(active, m, 0) / cos_theta
         density = self.intensity * beckmann(x, self.alpha) * slope_jacobian(cos_theta)
-        with dr.suspend_grad():
-            # P(h) = D_g(h) / D_l(0) (Eq. 7)
-            p = self.largest_p * dr.exp(-dr.squared_norm(x / self.alpha))
-            active &= p > dr.smallest(mi.Float)
-            hp = paraboloid_map(x, cos_theta) * self.cells_per_unit
+        return density, x, cos_theta, active
+
+    def reflecting_share(self, x: mi.Vector2f) -> mi.Float:
+        """P(h) = D_g(h) / D_l(0) (Eq. 7) for the slope x."""
+        return self.largest_p * dr.exp(-dr.squared_norm(x / self.alpha))
+
+    def cells(self, query: Query) -> CoveredCells:
+        """The cells that the footprint covers."""
         growth = dr.exp((self.density - dr.detach(self.density)) * log(10))
         footprint = query.footprint.among_details(growth)
-        noise = self.reflecting(hp, p, footprint, active) / dr.select(active, p, 1)
-        return dr.select(active, density * noise, 0)
+        return self.covered_cells(footprint, self.scale, self.stretch, self.max_anisotropy)
 
-    def reflecting(
-        self, hp: mi.Vector2f, p: mi.Float, footprint, active: mi.Bool
+    def zero(self) -> mi.Float | mi.Color3f:
+        """The empty sum of densities."""
+        return mi.Float(0) if self.colors is None else mi.Color3f(0)
+
+    def mean_color(self) -> mi.Float | mi.Color3f:
+        """The mean of :meth:`fraction` over P."""
+        return mi.Float(1) if self.colors is None else mi.Color3f(*self.colors.mean)
+
+    def fraction(
+        self, vertex: Vertex, cell: mi.Vector2i, binomial: ReflectingCount, active: mi.Bool
     ) -> mi.Float | mi.Color3f:
-        """The fraction of microdetails under the footprint that reflect (Listing 1, lines 7 to 24).
-
-        ``hp``: half vector on the paraboloid map, in cells; ``p``: P(h).
-        """
-        cells = self.covered_cells(footprint, self.scale, self.stretch, self.max_anisotropy)
-        binomial = ReflectingCount(p)
-
-        def fraction(x, y, level, active):
-            x, y, name = coherent_vertex(x, y, level)
-            a, b, c = pcg3d(x, y, name + self.seed)
-            # Line 12: quantise the half vector; the grid of half vectors is shifted in each cell
-            hidx = mi.Vector2u(mi.Vector2i(dr.floor(hp + mi.Vector2f(uniform(a), uniform(b)))))
-            a, b, c = pcg3d(hidx.x, hidx.y, c)
-            # Lines 14 and 16: a whole number of microdetails, at least one
-            n = power_of_two(2 * level)
-            if not is_literal_zero(self.size_variation):
-                n = dr.round(n * dr.abs(1 + self.size_variation * gaussian(a)))
-                n = dr.maximum(n, 1)
-            # Lines 18 and 20; D_l(0) cancels
-            count = binomial.draw(b, n, active)
-            if self.colors is None:
-                return count / n
-            # Section 4.5: the mean of N random colours differs from the mean colour by 1/√N
-            mean = mi.Color3f(*self.colors.mean)
-            color = self.colors.pick(uniform(c)) - mean
-            return count / n * (mean + color * dr.rsqrt(dr.maximum(count, 1)))
-
-        return cells.sum(fraction, mi.Float(0) if self.colors is None else mi.Color3f(0), active)
+        """The fraction of a vertex's microdetails that reflect for a cell of half vectors
+        (Listing 1, lines 14 to 20)."""
+        a, b, c = pcg3d(mi.UInt32(cell.x), mi.UInt32(cell.y), vertex.bits)
+        # Lines 14 and 16: a whole number of microdetails, at least one
+        n = power_of_two(2 * vertex.level)
+        if not is_literal_zero(self.size_variation):
+            n = dr.round(n * dr.abs(1 + self.size_variation * gaussian(a)))
+            n = dr.maximum(n, 1)
+        # Lines 18 and 20; D_l(0) cancels
+        count = binomial.draw(b, n, active)
+        if self.colors is None:
+            return count / n
+        # Section 4.5: the mean of N random colours differs from the mean colour by 1/√N
+        mean = mi.Color3f(*self.colors.mean)
+        color = self.colors.pick(uniform(c)) - mean
+        return count / n * (mean + color * dr.rsqrt(dr.maximum(count, 1)))
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         smooth, discontinuous = mi.ParamFlags.Differentiable, mi.ParamFlags.NonDifferentiable

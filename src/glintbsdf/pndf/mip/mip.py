@@ -35,7 +35,7 @@ from glintbsdf.maps.quilting import Synthesis, check_sizes, synthesise
 from glintbsdf.microfacet.mean_plane import lobe_area, slope_of
 from glintbsdf.pndf.base import PNDF, changed_map, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
-from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass
+from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass, point_of_ellipse
 from glintbsdf.pndf.manifold.mesh import add_where, where_needed
 from glintbsdf.pndf.mip import levels as lobe_levels
 from glintbsdf.pndf.mip.cells import LevelCells
@@ -91,6 +91,7 @@ class Mip(PNDF):
     Raises :class:`~.ParameterError`.
     """
 
+    integrates_lights = True
     maskings = ("footprint", "beckmann", "none")
 
     def __init__(
@@ -305,23 +306,26 @@ class Mip(PNDF):
 
         The query's footprint is given in the UV space of the large map.
         """
-        kernel, footprint = self.texel_kernel(query), query.footprint
+        kernel = self.texel_kernel(query)
         active = active & (dr.squared_norm(m) < 1)
         below, above, fraction = self.level(kernel)
-        density = self.level_density(m, footprint, kernel, below, active)
+        density = self.level_density(m, query, kernel, below, active)
         blended = active & (fraction > 0)
         finer = dr.select(blended, 1 - fraction, 1) * density
-        return finer + fraction * self.level_density(m, footprint, kernel, above, blended)
+        density = finer + fraction * self.level_density(m, query, kernel, above, blended)
+        return dr.maximum(density, 0) if query.spread else density
 
-    def level_density(self, m, footprint, kernel, level, active) -> mi.Float:
+    def level_density(self, m, query, kernel, level, active) -> mi.Float:
         """D(m) of one level."""
-        variance = dr.square(self.sigma_r)
-        active = active & self.grids.may_have(m, level, NORMAL_CUT * self.sigma_r, active)
+        variance, footprint, light = dr.square(self.sigma_r), query.footprint, query.spread
+        lit, turned = self.reach(query)
+        margin = NORMAL_CUT * (dr.sqrt(lit) + (0 if turned is None else turned))
+        active = active & self.grids.may_have(m, level, margin, active)
         cut, extent = self.cut(kernel, level), dr.gather(mi.Float, self.grids.extent, level, active)
         summed = self.mass_is_summed(level)
 
         def add(state, lobe, offset, sign, active):
-            near = lobe.may_show(m, variance)
+            near = lobe.may_show(m, lit, turned)
 
             def added(density, mass):
                 seen = lobe.under(offset, extent, *self.seen(kernel, sign))
@@ -329,7 +333,7 @@ class Mip(PNDF):
                 density = add_where(
                     density,
                     near & (weight > 0),
-                    lambda: weight * seen.normals().eval(m, variance),
+                    lambda: weight * seen.normals(self.turn(query, sign)).eval(m, variance, light),
                     active,
                 )
                 return density, mass + weight
@@ -341,6 +345,25 @@ class Mip(PNDF):
         )
         mass = dr.select(summed, mass, self.mass_of_texels(kernel))
         return dr.select(mass > 0, density / dr.select(mass > 0, mass, 1), 0)
+
+    def reach(self, query: Query) -> tuple[mi.Float, mi.Float | None]:
+        """What makes normals visible farther from a lobe's own: σ_r² with the variance of the
+        light's spread, and the standard deviation of the half vector over the footprint, None where
+        it does not turn. Both are of the two components together."""
+        variance = dr.square(self.sigma_r)
+        for v in query.spread:
+            variance = variance + dr.squared_norm(v)
+        if query.turn is None:
+            return variance, None
+        axes = query.footprint.du, query.footprint.dv
+        return variance, dr.sqrt(sum(dr.squared_norm(query.turn @ axis) for axis in axes))
+
+    def turn(self, query: Query, sign: mi.Vector2f) -> mi.Matrix2f | None:
+        """The half vector's turn per texel, in the frame of a copy of the map; None for none."""
+        if query.turn is None:
+            return None
+        x, y = sign * (1 / self.synthesis.size)
+        return query.turn @ mi.Matrix2f(x, 0, 0, y)
 
     def projected_areas(self, directions, query, active):
         """Those of the lobes, every one of them with its own."""
@@ -436,7 +459,12 @@ class Mip(PNDF):
         lobe = Lobe(self.words, index, active)
         seen = lobe.under(place, extent, *self.seen(kernel, side))
         normal = mi.warp.square_to_std_normal(mi.Point2f(sample2))
-        return seen.normals().sample(normal, dr.square(self.sigma_r))
+        seen = seen.normals(self.turn(query, side))
+        m = seen.sample(normal, dr.square(self.sigma_r))
+        if query.spread:
+            random = pcg3d(bits, name, dr.reinterpret_array(mi.UInt32, mi.Float(sample2[0])))
+            m = m + point_of_ellipse(query.spread, mi.Point2f(*map(uniform, random[:2])))
+        return m
 
     def seen(self, kernel: TexelKernel, sign: mi.Vector2f) -> tuple[tuple, mi.Float]:
         """Two vectors that make up the footprint's covariance (texels²), in the frame of a copy of

@@ -12,7 +12,8 @@ covariance Σ = V Vᵀ seen from the lobe's mean and scaled by L⁻¹, so that S
     mass N(d; 0, T)      normals N(· ; s + B T⁻¹ d, B Σ T⁻¹ Bᵀ + Q Qᵀ + σ_r² I)
 
 which is :mod:`glintbsdf.pndf.gaussian_elements` in units where S = I: nothing large is inverted,
-and all sums are of terms of one sign.
+and all sums are of terms of one sign. Where the half vector turns by H over the footprint, normals
+are seen relative to it: B becomes B − H L, and s becomes s + H L d.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.pndf.elements.elements import FADE
-from glintbsdf.pndf.gaussian_elements import Gaussian
+from glintbsdf.pndf.gaussian_elements import AveragedGaussian, Gaussian
 from glintbsdf.pndf.manifold.mesh import cross
 
 #: Standard deviations of a lobe's normals beyond which they are left out. This loses 1.5e-4 of the
@@ -112,10 +113,16 @@ class Lobe:
         self.mean_normal = normal_of(self.packed.z)
         self.spread = halves(self.packed.w)[0]
 
-    def may_show(self, m: mi.Vector2f, variance: mi.Float) -> mi.Bool:
-        """Whether ``m`` is near the lobe's normals; ``variance``: σ_r²."""
-        reach = NORMAL_CUT**2 * dr.fma(self.spread, self.spread, variance)
-        return dr.squared_norm(m - self.mean_normal) < reach
+    def may_show(self, m: mi.Vector2f, variance: mi.Float, turned: mi.Float | None) -> mi.Bool:
+        """Whether ``m`` is near the lobe's normals.
+
+        ``variance``: σ_r² and what a light's spread adds. ``turned``: standard deviation of the
+        half vector over the footprint; None where it does not turn.
+        """
+        variance = dr.fma(self.spread, self.spread, variance)
+        if turned is not None:
+            variance = dr.square(dr.sqrt(variance) + turned)
+        return dr.squared_norm(m - self.mean_normal) < NORMAL_CUT**2 * variance
 
     def under(self, offset, extent, vectors, cross_squared) -> SeenLobe:
         """The lobe under a footprint.
@@ -163,13 +170,22 @@ class SeenLobe:
         share = dr.clip((cut - distance) * (1 / FADE), 0, 1)
         return dr.select(self.lobe.active, self.mass * density * share, 0)
 
-    def normals(self) -> SeenNormals:
-        """The normals that the footprint sees."""
-        lobe, d = self.lobe, self.d
+    def normals(self, turn: mi.Matrix2f | None = None) -> SeenNormals:
+        """The normals that the footprint sees.
+
+        ``turn``: H of the half vector, per texel of the lobe's positions; None for zero.
+        """
+        lobe, d, mean = self.lobe, self.d, self.lobe.mean_normal
         packed = dr.gather(mi.Vector4u, lobe.words, 2 * lobe.index + 1, lobe.active)
         q_xx = halves(lobe.packed.w)[1]
         q_yx, q_yy = halves(packed.y)
         b = mi.Matrix2f(*halves(packed.z), *halves(packed.w))
+        if turn is not None:
+            inverse_x, inverse_y = dr.rcp(self.xx), dr.rcp(self.yy)
+            turned = turn @ mi.Matrix2f(
+                inverse_x, 0, -self.yx * inverse_x * inverse_y, inverse_y
+            )  # H L
+            b, mean = b - turned, mean + turned @ d
         shift = mi.Vector2f(d)  # T⁻¹ d |T|
         for v in self.vectors:
             shift = shift + mi.Vector2f(-v.y, v.x) * cross(v, d)
@@ -181,7 +197,7 @@ class SeenLobe:
         column = self.root * inverse * mi.Vector2f(xx, xy)
         height = dr.sqrt(self.determinant) * inverse
         return SeenNormals(
-            lobe.mean_normal + dr.square(self.root) * (b @ shift),
+            mean + dr.square(self.root) * (b @ shift),
             (b @ column, height * mi.Vector2f(b[0, 1], b[1, 1])),
             (q_xx, q_yx, q_yy),
         )
@@ -199,8 +215,9 @@ class SeenNormals:
     def __init__(self, mean: mi.Vector2f, vectors: tuple, rest: tuple) -> None:
         self.mean, self.vectors, self.rest = mean, vectors, rest
 
-    def eval(self, m: mi.Vector2f, variance: mi.Float) -> mi.Float:
-        """The density at ``m``; ``variance``: σ_r² > 0.
+    def eval(self, m: mi.Vector2f, variance: mi.Float, ellipse: tuple = ()) -> mi.Float:
+        """The density at ``m``, averaged over an ``ellipse``, which may be empty; ``variance``:
+        σ_r² > 0.
 
         As for positions: scaled by K⁻¹, K Kᵀ = Q Qᵀ + σ_r² I, the covariance is I + U Uᵀ, whose
         determinant and quadratic form are sums of squares.
@@ -216,6 +233,9 @@ class SeenNormals:
             return mi.Vector2f(v.x * inverse_x, dr.fma(-slope, v.x, v.y) * inverse_y)
 
         first, second = (scaled(v) for v in self.vectors)
+        if ellipse:
+            lobe = AveragedGaussian(Gaussian((first, second), 1.0), [scaled(v) for v in ellipse])
+            return inverse_x * inverse_y * lobe.eval(scaled(m - self.mean))
         trace = dr.squared_norm(first) + dr.squared_norm(second)
         root = dr.rsqrt(1 + trace + dr.square(cross(first, second)))
         distance = scaled_distance((first, second), scaled(m - self.mean), root)
