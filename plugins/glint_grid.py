@@ -46,7 +46,8 @@ Glitter, snow, sand and brushed metal from a few numbers, without a map.
    - Half angle of the cone that the light fills, as seen from the surface, in radians from 0 to
      less than :math:`\pi/2`. More microdetails reflect a wide light, so glints are weaker and the
      surface looks smoother. The blur of the highlight by the light's shape is left to the
-     integrator. (Default: 0, a point)
+     integrator. :ref:`glint_path <integrator-glint_path>` integrates small lights as they are, and
+     needs none of it. (Default: 0, a point)
    - |exposed|
 
  * - colors
@@ -101,6 +102,12 @@ of which :math:`n_C` reflect. The mean of :math:`D` over all places is exactly :
 place is *not* normalised: a surplus of microdetails in one direction is not compensated in others,
 so the place may reflect more light than it receives. The sampler draws visible normals of the
 smooth surface, and the glints are in the weight of a sample.
+
+*Lights.* :ref:`glint_path <integrator-glint_path>` lets it integrate small lights. Under a light
+:math:`D` is its mean over the ellipse of half vectors that the light covers, cell by cell of the
+half vectors in which microdetails are counted, up to four by four of them. Where there are more, a
+cell stands for several, with a weight that keeps mean and variance. Along a long footprint, each
+cell of the surface has a half vector of its own.
 
 Stretched UV coordinates stretch microdetails. Microdetails finer than four spacings of float32 UV
 coordinates are not resolved.

@@ -139,6 +139,11 @@ and 9 % (relative L1) on a map of Gaussian bumps, and by 7 to 10 % on one of scr
 a query takes a seventh of the time that the elements take, at 16 and below two to four times as
 long; where most of the surface reflects nothing, the elements are faster still.
 
+*Lights.* :ref:`glint_path <integrator-glint_path>` lets the lobes integrate small lights: a lobe is
+averaged over the ellipse of a light in closed form, and its Jacobian is relative to the half vector,
+where that turns over the footprint. With :monosp:`representation` :monosp:`exact`, lights are
+sampled.
+
 *The map exactly.* Every texel of the large map is one of the sample's, seen through the patch that
 owns it. With :monosp:`representation` :monosp:`exact`, footprints of a few texels sum the elements
 of the large map's texels; larger ones walk inverted lists of the sample's elements, once for every

@@ -15,7 +15,10 @@ from glintbsdf.check import suite
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.core.hashing import pcg3d
 from glintbsdf.pndf import Grid
-from glintbsdf.pndf.grid.microdetails import CoveredCells, ReflectingCount
+from glintbsdf.footprint.query import Query
+from glintbsdf.pndf.colors import Wheel
+from glintbsdf.pndf.grid.ellipse import Part
+from glintbsdf.pndf.grid.microdetails import SHORTENING, CoveredCells, ReflectingCount
 
 GROOVES = {"detail_alpha_u": 0.3, "detail_alpha_v": 0.03}
 SURFACES = {
@@ -27,6 +30,16 @@ SURFACES = {
     "wide_light": {"light_spread": 0.2},
     "varied": {"size_variation": 2.0},
     "equal": {"size_variation": 0.0},
+}
+# Options, a deviation of half vectors along u, and the tolerance of D averaged over this ellipse.
+# Measured: 0.007, 0.08, 0.29, 0.05 and 0.03; a part of the ellipse of many cells is seen as one.
+BOUNDS = ((-0.4, -0.4), (0.4, 0.4))
+SPREADS = {
+    "small": ({}, 0.0025, 0.01),
+    "lamp": ({"detail_alpha": (0.02, 0.02)}, 0.02, 0.1),
+    "many cells": ({"detail_alpha": (0.02, 0.02)}, 0.1, 0.36),
+    "grooves": ({"detail_alpha": (0.3, 0.03)}, 0.02, 0.06),
+    "wheel": ({"colors": Wheel()}, 0.02, 0.04),
 }
 # A rotated footprint with a few microdetails, whose reflections stay above the horizon.
 RESOLVED = View(du=(4e-4, 3e-4), dv=(-1.5e-4, 2e-4), wi=(0.3, 0.1, 1))
@@ -188,6 +201,63 @@ def test_anisotropy_is_limited(variant):
     assert covered(long, max_anisotropy=16.0).level[0] == 5  # 2 · 320 cells / 16 = 40
     assert covered(long, max_anisotropy=64.0).level[0] == 3
     assert covered(long, max_anisotropy=1e6).level[0] == 1
+
+
+# --------------------------------------------------------------------------------------------------
+#  Lights
+# --------------------------------------------------------------------------------------------------
+
+
+def test_moments_of_parts_of_a_disk(variant):
+    """Share, mean and mean square of the part between two lines, against counted points."""
+    x = suite.golden_spiral(1_000_000)[0]
+    for a, b in ((-1.5, 0.3), (-0.2, -0.1), (0.9, 2.0), (-3.0, 3.0)):
+        found = [np.array(v)[0] for v in Part.between(mi.Float(a), mi.Float(b))]
+        inside = x[(x > a) & (x < b)]
+        expected = inside.size / x.size, inside.mean(), (inside**2).mean()
+        assert np.allclose(found, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", SPREADS)
+def test_spread_of_few_microdetails(variant, name):
+    """Under a light, the very microdetails are seen that are seen under its points."""
+    options, size, tolerance = SPREADS[name]
+    grid = Grid(density=7.0, **options)
+    spread = (size, 0.3 * size), (0.0, 0.8 * size)
+    footprint = Footprint.isotropic(mi.Point2f(0.37, 0.61), 4e-4)
+    options = {"mass": tolerance, "res": 20, "points": 4}
+    suite.check_spread(grid, footprint, spread, BOUNDS, tolerance, **options)
+
+
+def test_half_vectors_turn_along_a_footprint(variant):
+    """A long footprint equals round ones along its median, each with the half vector there."""
+    grid, turn = Grid(density=6.0, detail_alpha=(0.03, 0.03)), np.array([[9.0, 3.0], [4.0, -5.0]])
+    major, minor, count = 8e-3, 1e-3, 101
+    half = major - SHORTENING * 2 * minor
+    t = np.linspace(-1, 1, count)
+    turned = np.outer(turn[:, 0], np.sqrt(3) * half * t)
+    left = turn @ np.diag([np.sqrt(major**2 - half**2), minor])
+    rng = np.random.default_rng(4)
+    m, uv = 0.2 * rng.standard_normal((2, 300)), rng.random((2, 300))
+
+    def values(moved, offset, du, **options):
+        many = np.repeat(m, moved.shape[1], 1) + np.tile(moved, m.shape[1])
+        place = np.repeat(uv, moved.shape[1], 1)
+        place[0] += np.tile(offset, m.shape[1])
+        footprint = Footprint(
+            mi.Point2f(place.astype(np.float32)), mi.Vector2f(du, 0), mi.Vector2f(0, minor)
+        )
+        density = grid.eval(mi.Vector2f(many.astype(np.float32)), Query(footprint, **options))
+        return np.array(density, np.float64).reshape(m.shape[1], -1).mean(1)
+
+    whole = np.zeros((2, 1)), np.zeros(1), major
+    spread = tuple(mi.Vector2f(*(float(x) for x in v)) for v in left.T)
+    expected = values(turned, half * t, minor, spread=spread)
+    found, reversed_ = (
+        values(*whole, turn=mi.Matrix2f(np.float32(sign * turn))) for sign in (1, -1)
+    )
+    error, wrong = (np.abs(v - expected).sum() / expected.sum() for v in (found, reversed_))
+    assert error < 0.1 and wrong > 3 * error, (error, wrong)
 
 
 # --------------------------------------------------------------------------------------------------

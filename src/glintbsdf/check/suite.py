@@ -1,4 +1,5 @@
-"""The test suite for glint BSDFs, as functions: each takes a BSDF and raises if the test fails.
+"""The test suite for glint BSDFs, as functions: each takes a BSDF, or a P-NDF where it says so, and
+raises if the test fails.
 
 The footprint is set through ``si.duv_dx`` and ``si.duv_dy``, as ``glint_path`` does. The BSDFs must
 have ``footprint_sigma`` 1, so that a :class:`View` gives standard deviations.
@@ -23,6 +24,9 @@ import scipy.stats
 
 from glintbsdf import NormalMap
 from glintbsdf.check.reference import binned_pndf
+from glintbsdf.footprint.gaussian import Footprint
+from glintbsdf.footprint.query import Query
+from glintbsdf.pndf.base import PNDF
 
 Pair = tuple[float, float]
 Bounds = tuple[Pair, Pair]
@@ -431,6 +435,166 @@ def check_derivative(bsdf: mi.BSDF, view: View, key: str, count: int = 50) -> No
     assert dr.isfinite(reverse) and reverse != 0
     # The two modes sum the same float32 terms of either sign in different orders.
     assert dr.allclose(forward, reverse, rtol=1e-3), (forward, reverse)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Lights: the spread and the turn of a query
+# --------------------------------------------------------------------------------------------------
+
+
+def golden_spiral(count: int) -> np.ndarray:
+    """``count`` points of the unit disk (2×N), each of which stands for the same area."""
+    k = np.arange(count) + 0.5
+    radius, angle = np.sqrt(k / count), k * np.pi * (3 - 5**0.5)
+    return radius * np.stack([np.cos(angle), np.sin(angle)])
+
+
+def binned_density(
+    pndf: PNDF, query: Query | Footprint, bounds: Bounds, res: int, points: int, moved=None
+) -> np.ndarray:
+    """Mass of D in each of ``res``² bins over ``bounds``, by ``points``² points of each bin.
+
+    ``moved``: offsets of normals (2×N); the result is then the mean over all of them, the k-th lane
+    of ``query`` being for the k-th one.
+    """
+    lower, upper = np.array(bounds, float)
+    n, count = res * points, 1 if moved is None else moved.shape[1]
+    place = np.stack(np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2)).reshape(2, -1)
+    m = lower[:, None] + (upper - lower)[:, None] * place
+    if moved is not None:
+        m = (m[:, :, None] + moved[:, None]).reshape(2, -1)
+    values = np.array(pndf.eval(mi.Vector2f(m.astype(np.float32)), query), np.float64)
+    values = values.reshape(-1, n * n, count).mean(axis=(0, 2))  # of all colours as well
+    area = np.prod((upper - lower) / n)
+    return values.reshape(res, points, res, points).sum(axis=(1, 3)) * area
+
+
+def relative_l1(found: np.ndarray, expected: np.ndarray) -> float:
+    """The sum of all differences, relative to the sum of what is expected."""
+    return float(np.abs(found - expected).sum() / expected.sum())
+
+
+def assert_close(
+    found: np.ndarray, plain: np.ndarray, expected: np.ndarray, tolerance: float, mass: float
+) -> None:
+    """Masses in bins agree: their relative L1 error is less than the ``tolerance``, and that of the
+    whole mass is less than ``mass``. The error of the ``plain`` ones, which leave out what is
+    tested, is more than twice as large as the tolerance."""
+    print("L1", relative_l1(found, expected), found.sum() / expected.sum() - 1, relative_l1(plain, expected))
+    error, missing = relative_l1(found, expected), found.sum() / expected.sum() - 1
+    assert error < tolerance, f"relative L1 error {error:.3g}, tolerance {tolerance:.3g}"
+    assert abs(missing) < mass, f"relative difference of mass {missing:.3g}, tolerance {mass:.3g}"
+    without = relative_l1(plain, expected)
+    assert without > 2 * tolerance, f"a test without power: {without:.3g} without the effect"
+
+
+def lit(pndf: PNDF) -> PNDF:
+    """The P-NDF, prepared for queries with a spread or a turn; it must say that it knows them."""
+    assert pndf.integrates_lights
+    pndf.prepare_for_lights()
+    return pndf
+
+
+def check_spread(
+    pndf: PNDF,
+    footprint: Footprint,
+    spread: tuple[Pair, Pair],
+    bounds: Bounds,
+    tolerance: float,
+    mass: float = 0.01,
+    res: int = 10,
+    points: int = 6,
+    lights: int = 80,
+) -> None:
+    """D under a light's spread is the mean of D, without a spread, over points of its ellipse.
+
+    Args:
+        pndf: a P-NDF that integrates lights.
+        spread: two vectors whose outer products add up to the covariance of the ellipse.
+        bounds: of projected normals.
+        tolerance: relative L1 error of masses in ``res``² bins.
+        mass: relative error of the whole mass.
+        lights: number of points of the ellipse.
+    """
+    vectors = tuple(mi.Vector2f(*(dr.opaque(mi.Float, x) for x in v)) for v in spread)
+    bins = bounds, res, points
+    found = binned_density(lit(pndf), Query(footprint, spread=vectors), *bins)
+    # The radius of a disk is twice its standard deviation along an axis.
+    moved = 2 * np.transpose(spread) @ golden_spiral(lights)
+    expected = binned_density(pndf, footprint, *bins, moved)
+    assert_close(found, binned_density(pndf, footprint, *bins), expected, tolerance, mass)
+
+
+def check_turn(
+    pndf: PNDF,
+    view: View,
+    turn: np.ndarray,
+    bounds: Bounds,
+    tolerance: float,
+    mass: float = 0.01,
+    share: float = 0.96,
+    res: int = 10,
+    points: int = 6,
+    parts: int = 120,
+) -> None:
+    """With a half vector that turns over the footprint, D is the mean of D over small footprints
+    inside of it, each with the half vector of its centre.
+
+    Args:
+        pndf: a P-NDF that integrates lights.
+        view: the footprint.
+        turn: H, 2×2, per unit of UV.
+        bounds, tolerance, mass: as of :func:`check_spread`.
+        share: of the variance of the footprint, that of the centres of the small ones.
+        parts: number of small footprints.
+    """
+
+    def footprint(uv, scale: float) -> Footprint:
+        return Footprint(
+            mi.Point2f(uv),
+            *(mi.Vector2f(*(float(scale * x) for x in axis)) for axis in (view.du, view.dv)),
+        )
+
+    whole, bins = footprint(view.uv, 1.0), (bounds, res, points)
+    query = Query(whole, mi.Matrix2f(np.asarray(turn, np.float32)))
+    found = binned_density(lit(pndf), query, *bins)
+    disk = golden_spiral(parts)
+    squared = (disk**2).sum(axis=0)
+    normal = disk * np.sqrt(-2 * np.log1p(-squared) / squared)  # Box and Muller
+    offset = np.sqrt(share) * np.transpose([view.du, view.dv]) @ normal
+    uv = np.array(view.uv)[:, None] + np.tile(offset, (res * points) ** 2)
+    small = footprint(uv.astype(np.float32), np.sqrt(1 - share))
+    expected = binned_density(pndf, small, *bins, np.asarray(turn) @ offset)
+    assert_close(found, binned_density(pndf, whole, *bins), expected, tolerance, mass)
+
+
+#: Spreads (standard deviations) and turns (per footprint) that break careless code: none, below
+#: rounding, wider than the disk of normals.
+EXTREME_SPREADS = (0.0, 1e-12, 1e-4, 0.3, 3.0)
+EXTREME_TURNS = (0.0, 1e-9, 1.0, 100.0)
+
+
+def check_extreme_lights(pndf: PNDF, sigmas=(0.0, 1e-7, 0.01, 1.0)) -> None:
+    """D is finite and not negative under any light and for any turn, and 0 outside of the disk.
+
+    ``sigmas``: of the footprints, UV.
+    """
+    radius, angle = np.array([0, 1e-4, 0.1, 0.5, 0.9, 0.9999, 1.0, 1.1]), np.arange(7)
+    m = np.stack([np.outer(radius, f(angle)).ravel() for f in (np.cos, np.sin)])
+    count = m.shape[1]
+    cases = np.meshgrid(np.arange(count), EXTREME_SPREADS, EXTREME_TURNS, sigmas, indexing="ij")
+    index, spread, turn, sigma = (np.ravel(x) for x in cases)
+    spread, sigma = mi.Float(spread.astype(np.float32)), mi.Float(sigma.astype(np.float32))
+    turn = mi.Float(turn.astype(np.float32)) / dr.maximum(sigma, 1e-3)
+    query = Query(
+        Footprint.isotropic(mi.Point2f(0.37, 0.61), sigma),
+        mi.Matrix2f(turn, 0.3 * turn, -0.5 * turn, 0.2 * turn),
+        (mi.Vector2f(spread, 0.3 * spread), mi.Vector2f(0, 1e-3 * spread)),
+    )
+    density = np.array(lit(pndf).eval(mi.Vector2f(m[:, index].astype(np.float32)), query))
+    assert np.isfinite(density).all() and (density >= 0).all()
+    outside = np.hypot(*m[:, index]) > 1
+    assert (density[..., outside] == 0).all() and (density > 0).any()
 
 
 # --------------------------------------------------------------------------------------------------

@@ -352,11 +352,16 @@ class Particles(PNDF):
         return kept[0]
 
     def smooth_density(self, m: mi.Vector3f, query: Query) -> mi.Float:
-        """D of all facets together, under the light's extent, of which slopes count as the normals
-        that they nearly are where most of the facets are."""
-        if not query.spread:
+        """D of all facets together, under the light's extent and the half vector's turn over the
+        footprint, of which slopes count as the normals that they nearly are where most of the
+        facets are."""
+        spread = query.spread
+        if query.turn is not None:
+            axes = query.footprint.du, query.footprint.dv
+            spread = (*spread, *(query.turn @ axis for axis in axes))
+        if not spread:
             return self.mean.distribution.eval(m)
-        width = Gaussian(query.spread)
+        width = Gaussian(spread)
         uu = dr.fma(2, width.xx, dr.square(self.alpha.x))
         vv = dr.fma(2, width.yy, dr.square(self.alpha.y))
         uv = 2 * width.xy
