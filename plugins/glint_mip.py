@@ -140,9 +140,9 @@ a query takes a seventh of the time that the elements take, at 16 and below two 
 long; where most of the surface reflects nothing, the elements are faster still.
 
 *Lights.* :ref:`glint_path <integrator-glint_path>` lets the lobes integrate small lights: a lobe is
-averaged over the ellipse of a light in closed form, and its Jacobian is relative to the half vector,
-where that turns over the footprint. With :monosp:`representation` :monosp:`exact`, lights are
-sampled.
+averaged over the ellipse of a light in closed form, and its Jacobian is relative to the half
+vector, where that turns over the footprint. With :monosp:`representation` :monosp:`exact`, lights
+are sampled.
 
 *The map exactly.* Every texel of the large map is one of the sample's, seen through the patch that
 owns it. With :monosp:`representation` :monosp:`exact`, footprints of a few texels sum the elements

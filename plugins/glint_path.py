@@ -93,12 +93,13 @@ One of the remaining emitters, environments among them, is chosen in proportion 
 **The P-NDF integrates small lights** in BSDFs that are able to do so, which are
 :ref:`glint_elements <bsdf-glint_elements>`, :ref:`glint_manifold <bsdf-glint_manifold>`,
 :ref:`glint_filtered <bsdf-glint_filtered>`, :ref:`glint_mip <bsdf-glint_mip>` with lobes,
-:ref:`glint_grid <bsdf-glint_grid>` and :ref:`glint_particles <bsdf-glint_particles>`. A light is small if it looks like a disk with a radius of at most 0.5 radians, or like another surface
-with such a variance of directions. This variance is split as the pixel's filter is. A share becomes
-a spread of half vectors, a uniform ellipse, over which the P-NDF is averaged. The
-rest is sampled, by directions contracted towards the light's centre. A share of 1 leaves no noise
-except that of shadows and textures of the light. But it rounds the corners of a rectangle, so for
-other shapes than spheres and disks it falls sooner.
+:ref:`glint_grid <bsdf-glint_grid>` and :ref:`glint_particles <bsdf-glint_particles>`. A light is
+small if it looks like a disk with a radius of at most 0.5 radians, or like another surface with
+such a variance of directions. This variance is split as the pixel's filter is. A share becomes a
+spread of half vectors, a uniform ellipse, over which the P-NDF is averaged. The rest is sampled, by
+directions contracted towards the light's centre. A share of 1 leaves no noise except that of
+shadows and textures of the light. But it rounds the corners of a rectangle, so for other shapes
+than spheres and disks it falls sooner.
 Visibility and radiance are taken at the sampled points, so shadows and textures keep their mean.
 BSDF sampling then leaves these lights out, and nothing counts twice.
 

@@ -47,7 +47,7 @@ class Case:
     points: int = 6
 
 
-MANIFOLD = Case({"epsilon": 1e-4}, 0.035, 0.1, mass=0.06, scale=2.0, points=12)
+MANIFOLD = Case({"epsilon": 1e-4}, 0.05, 0.1, mass=0.06, scale=2.0, points=12)
 CASES = {
     "elements": Case({"sigma_r": 0.02}, 0.032, 0.032),
     "filters": Case({"method": "lean", "alpha": 0.1, "distribution": "beckmann"}, 0.013, 0.12),
@@ -61,9 +61,7 @@ CASES = {
         0.026,
         scale=0.03,
     ),
-    "particles": Case(
-        {"density": 9.0, "alpha": (0.1, 0.1)}, 0.07, 0.2, scale=0.03, turned=1.5
-    ),
+    "particles": Case({"density": 9.0, "alpha": (0.1, 0.1)}, 0.07, 0.135, 0.03, 0.03, 1.5),
 }
 METHODS = [name for name, method in methods().items() if method.pndf.integrates_lights]
 

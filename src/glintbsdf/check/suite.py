@@ -480,7 +480,6 @@ def assert_close(
     """Masses in bins agree: their relative L1 error is less than the ``tolerance``, and that of the
     whole mass is less than ``mass``. The error of the ``plain`` ones, which leave out what is
     tested, is more than twice as large as the tolerance."""
-    print("L1", relative_l1(found, expected), found.sum() / expected.sum() - 1, relative_l1(plain, expected))
     error, missing = relative_l1(found, expected), found.sum() / expected.sum() - 1
     assert error < tolerance, f"relative L1 error {error:.3g}, tolerance {tolerance:.3g}"
     assert abs(missing) < mass, f"relative difference of mass {missing:.3g}, tolerance {mass:.3g}"

@@ -54,13 +54,13 @@ class Part(NamedTuple):
         """The part with the abscissa from ``a`` to ``b``."""
         (share_a, first_a, second_a), (share_b, first_b, second_b) = map(disk_moments, (a, b))
         share = share_b - share_a
-        inverse = dr.select(share > 1e-6, dr.rcp(dr.maximum(share, 1e-6)), 0)
+        inverse = dr.rcp(dr.maximum(share, 1e-6))
         middle = 0.5 * (dr.clip(a, -1, 1) + dr.clip(b, -1, 1))
         thin = share <= 1e-3  # where differences lose all digits
         return Part(
             dr.maximum(share, 0),
-            dr.select(thin, middle, inverse * (first_b - first_a)),
-            dr.select(thin, middle * middle, inverse * (second_b - second_a)),
+            mi.Float(dr.select(thin, middle, inverse * (first_b - first_a))),
+            mi.Float(dr.select(thin, middle * middle, inverse * (second_b - second_a))),
         )
 
 
@@ -134,9 +134,7 @@ class EllipseOfCells:
 
         return dr.maximum(count, 1), part
 
-    def sum(
-        self, m: mi.Vector2f, shift: mi.Vector2f, term: Callable, zero, active: mi.Bool
-    ):
+    def sum(self, m: mi.Vector2f, shift: mi.Vector2f, term: Callable, zero, active: mi.Bool):
         """Σ share · term(x, y, n, active) over all parts, each with the cell (x, y) and the mean n
         of its projected half vectors.
 

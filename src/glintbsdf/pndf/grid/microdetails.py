@@ -207,9 +207,7 @@ class CoveredCells:
             weights = (weight * (1 - fraction), weight * fraction) if self.rows == 2 else (weight,)
             for j, share in enumerate(weights):
                 vertex = self.swapped(mi.Vector2i(p0 + i, row + j))
-                total = total + share * term(
-                    vertex.x, vertex.y, level, active & (share > 0), along
-                )
+                total = total + share * term(vertex.x, vertex.y, level, active & (share > 0), along)
             return step + 1, total
 
         end = finer_columns + coarser_columns
@@ -562,6 +560,8 @@ class Grid(PNDF):
         Along the footprint's median the half vector turns from vertex to vertex. Elsewhere a vertex
         does not tell where in the footprint its microdetails are: this part of the turn widens the
         ellipse.
+
+        Derivatives are those of the Beckmann density at the ellipse's centre, relative to it.
         """
         turn, spread = query.turn, query.spread
         active = active & (dr.squared_norm(m) < 1)
@@ -579,19 +579,23 @@ class Grid(PNDF):
 
             def at_normal(x, y, m, active):
                 density, slope, _, active = self.mean_density(m, active)
-                with dr.suspend_grad():
-                    p = self.reflecting_share(slope)
-                    active &= p > dr.smallest(mi.Float)
-                    binomial = ReflectingCount(dr.select(active, p, 0.5))
-                    noise = self.fraction(vertex, mi.Vector2i(x, y), binomial, active)
-                    noise = noise / dr.select(active, p, 1)
-                    noise = dr.fma(ellipse.beta, noise - self.mean_color(), self.mean_color())
+                p = self.reflecting_share(slope)
+                active &= p > dr.smallest(mi.Float)
+                binomial = ReflectingCount(dr.select(active, p, 0.5))
+                noise = self.fraction(vertex, mi.Vector2i(x, y), binomial, active)
+                noise = noise / dr.select(active, p, 1)
+                noise = dr.fma(ellipse.beta, noise - self.mean_color(), self.mean_color())
                 return dr.select(active, density * noise, 0)
 
-            seen = m if turn is None else m + turned * along
-            return ellipse.sum(seen, vertex.shift, at_normal, self.zero(), active)
+            with dr.suspend_grad():
+                seen = m if turn is None else m + turned * along
+                return ellipse.sum(seen, vertex.shift, at_normal, self.zero(), active)
 
-        return dr.select(active, cells.sum(at_vertex, self.zero(), active), 0)
+        total = cells.sum(at_vertex, self.zero(), active)
+        centre = self.mean_density(m, active)[0]
+        above = centre > 0
+        growth = dr.select(above, centre, 1) / dr.detach(dr.select(above, centre, 1))
+        return dr.select(active, total * growth, 0)
 
     def mean_density(self, m: mi.Vector2f, active: mi.Bool) -> tuple:
         """``(D_g(m), slope, cosθ, active)``: the mean over all places, and where m is above the
@@ -621,9 +625,7 @@ class Grid(PNDF):
         """The mean of :meth:`fraction` over P."""
         return mi.Float(1) if self.colors is None else mi.Color3f(*self.colors.mean)
 
-    def fraction(
-        self, vertex: Vertex, cell: mi.Vector2i, binomial: ReflectingCount, active: mi.Bool
-    ) -> mi.Float | mi.Color3f:
+    def fraction(self, vertex, cell, binomial, active):
         """The fraction of a vertex's microdetails that reflect for a cell of half vectors
         (Listing 1, lines 14 to 20)."""
         a, b, c = pcg3d(mi.UInt32(cell.x), mi.UInt32(cell.y), vertex.bits)
