@@ -363,7 +363,7 @@ def test_derivative_by_the_scale_of_a_map(variant):
     assert np.allclose(dr.grad(image), expected, rtol=1e-3, atol=1e-4 * expected.max())
 
 
-@pytest.mark.parametrize("case", ["rough", "grid", "shares"])
+@pytest.mark.parametrize("case", ["rough", "shares"])
 def test_scenes_without_need_look_for_none(variant, monkeypatch, case):
     """Without BSDFs that integrate lights, environments are not searched for regions."""
 
@@ -371,8 +371,7 @@ def test_scenes_without_need_look_for_none(variant, monkeypatch, case):
         raise AssertionError("searched")
 
     monkeypatch.setattr("glintbsdf.lights.small.find_regions", fails)
-    bsdf = {"type": "glint_grid"} if case == "grid" else {"type": "roughconductor"}
-    ball = {"type": "sphere", "bsdf": bsdf}
+    ball = {"type": "sphere", "bsdf": {"type": "roughconductor"}}
     sensor = glints().sensors()[0]
     scene = glints(sky=studio()) if case == "shares" else None
     if scene is None:
