@@ -108,11 +108,8 @@ looks among samples of the environment for regions that are at least 16 times as
 and that make at least a sixteenth of its noise. It cuts them out as ellipses, and samples each at
 every hit. BSDFs that integrate lights do not see the rest of the environment in these directions,
 whether it is sampled by its emitter or by the BSDF. Radiance is always that of the environment.
-With the sun of ``sunsky``, or one of a map, above the curved patch of
-``scenes/curved_patch.xml``, 16 samples per pixel have a thirtieth to a fiftieth of the variance
-that they have without regions. A softbox is wider and dimmer. It would have twice the
-noise as a region, since BSDF sampling finds it well, so it stays in the environment. Regions are
-found anew for every image.
+A softbox is wider and dimmer. BSDF sampling finds it well, so it stays in the environment. Regions
+are found anew for every image.
 
 The half vector turns over a footprint, as the surface is curved, and as camera and light are near.
 The integrator passes this turn to these BSDFs, whose P-NDF then sees the map as if its normals

@@ -25,6 +25,7 @@ from benchmarks.cases import (
 from benchmarks.harness import Run, family
 from benchmarks.methods import SIGMA_R
 from glintbsdf import NormalMap
+from glintbsdf.check import suite
 from glintbsdf.check.stiff import white_noise
 from glintbsdf.maps.quilting import lobe_features, synthesise
 from glintbsdf.pndf import Mip
@@ -58,17 +59,12 @@ def density_at(pndf, uv: tuple, width: float, m: mi.Vector2f) -> np.ndarray:
     return pndf.eval(m, footprint).numpy()
 
 
-def relative_l1(a: np.ndarray, b: np.ndarray) -> float:
-    """Relative L1 difference of ``a`` to ``b``."""
-    return float(np.abs(a - b).sum() / b.sum())
-
-
 def largest_jump(pndf: Mip, widest: float) -> dict:
     """The largest relative L1 change while the footprint grows by 1 % from 16 texels on."""
     m, before, jumps = all_normals(pndf.normal_map), None, []
     for width in 16 * 1.01 ** np.arange(0, np.log(widest / 16) / np.log(1.01)):
         now = density_at(pndf, PLACES[0], width, m)
-        jumps += [] if before is None else [relative_l1(now, before)]
+        jumps += [] if before is None else [suite.relative_l1(now, before)]
         before = now
     return {"largest_jump": max(jumps)}
 

@@ -47,14 +47,14 @@ class Case:
     points: int = 6
 
 
-MANIFOLD = Case({"epsilon": 1e-4}, 0.05, 0.1, mass=0.06, scale=2.0, points=12)
+MANIFOLD = Case({"epsilon": 1e-4}, 0.05, 0.1, mass=0.03, scale=2.0, points=12)
 CASES = {
-    "elements": Case({"sigma_r": 0.02}, 0.032, 0.032),
+    "elements": Case({"sigma_r": 0.02}, 0.03, 0.032),
     "filters": Case({"method": "lean", "alpha": 0.1, "distribution": "beckmann"}, 0.013, 0.12),
     "manifold": MANIFOLD,
     "clusters": MANIFOLD,
     "tables": MANIFOLD,
-    "mip": Case({"output_size": 128, "patch_size": 28, "sigma_r": 0.02}, 0.01),
+    "mip": Case({"output_size": 128, "patch_size": 28, "sigma_r": 0.02}, 0.007, 0.03),
     "grid": Case(
         {"density": 14.0, "alpha": (0.1, 0.1), "detail_alpha": (0.02, 0.02)},
         0.018,

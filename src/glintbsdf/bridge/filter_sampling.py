@@ -14,14 +14,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.hashing import pcg3d, uniform
+from glintbsdf.core.hashing import LATTICE_STEPS, pcg3d, uniform
 from glintbsdf.footprint.pixel_filter import PixelFilter
 
 #: Largest number of samples of a wavefront: they are counted in 32 bits.
 LARGEST_WAVEFRONT = 2**32 - 1
-
-#: Steps of Roberts's two-dimensional low-discrepancy sequence: the powers of 1/ρ, ρ³ = ρ + 1.
-LATTICE_STEPS = 0.7548776662466927, 0.5698402909980532
 
 
 @dataclass

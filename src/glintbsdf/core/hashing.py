@@ -16,6 +16,10 @@ import mitsuba as mi
 # The multiplier and increment of the congruential generator, as in Numerical Recipes.
 MULTIPLIER, INCREMENT = 1664525, 1013904223
 
+#: Steps of Roberts's two-dimensional low-discrepancy sequence: the powers of 1/ρ, ρ³ = ρ + 1
+#: ("The Unreasonable Effectiveness of Quasirandom Sequences", 2018).
+LATTICE_STEPS = 0.7548776662466927, 0.5698402909980532
+
 
 def pcg3d(x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
     """Three hashed integers, each of which depends on all bits of the three arguments."""

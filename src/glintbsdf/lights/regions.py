@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from glintbsdf.core.hashing import LATTICE_STEPS
 from glintbsdf.core.loops import symbolic_loop
 from glintbsdf.core.opaque import stored
 from glintbsdf.lights.view import MAX_DEVIATION, View
@@ -193,8 +194,8 @@ def mean_over_colours(spectrum: mi.Spectrum, count: int) -> np.ndarray:
 def samples_of(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples of an environment, as :func:`find_regions` takes them. Radiance is the mean over
     colours; samples whose values are not finite are black."""
-    # A low-discrepancy sequence leaves no gaps (powers of 1/ρ, ρ³ = ρ + 1)
-    random = (0.5 + np.outer((0.7548776662466927, 0.5698402909980532), np.arange(SAMPLES))) % 1
+    # A low-discrepancy sequence leaves no gaps.
+    random = (0.5 + np.outer(LATTICE_STEPS, np.arange(SAMPLES))) % 1
     random = np.minimum(random.astype(np.float32), np.float32(1 - 2**-24))
     with dr.suspend_grad():
         ds, weight = environment.sample_direction(observer(), mi.Point2f(random))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from glintbsdf import Footprint, NormalMap, maps
+from glintbsdf.check import suite
 from glintbsdf.footprint.kernels import SIGMA_MIN
 from glintbsdf.maps.quilting import synthesise
 from glintbsdf.pndf import Mip
@@ -62,10 +63,6 @@ def sum_of_texels(mip: Mip, uv, sigma: float, normals: np.ndarray) -> np.ndarray
     return result
 
 
-def relative_l1(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.abs(a - b).sum() / b.sum())
-
-
 # --------------------------------------------------------------------------------------------------
 #  Against sums in double precision
 # --------------------------------------------------------------------------------------------------
@@ -79,7 +76,7 @@ def test_texels_are_summed(variant, sigma, uv):
     assert mip.level(mip.texel_kernel(footprint))[1][0] == 0
     expected = sum_of_texels(mip, uv, sigma, normals)
     # The cut at three standard deviations: measured up to 0.9 %
-    assert relative_l1(density(mip, footprint, normals), expected) < 0.02
+    assert suite.relative_l1(density(mip, footprint, normals), expected) < 0.02
 
 
 @pytest.mark.parametrize("sigma_r", [1e-2, 1e-4])
@@ -102,7 +99,7 @@ def test_clusters_of_every_level_are_near_the_texels(variant):
     mip, normals, uv = make(clusters=32), grid(), (0.43, 0.28)
     for sigma in (6.0, 9.0, 14.0):
         actual = density(mip, round_footprint(mip, uv, sigma), normals)
-        error = relative_l1(actual, sum_of_texels(mip, uv, sigma, normals))
+        error = suite.relative_l1(actual, sum_of_texels(mip, uv, sigma, normals))
         assert error < 0.15, (sigma, error)  # measured 0.05 to 0.10
 
 
@@ -112,7 +109,7 @@ def test_more_clusters_are_nearer(variant):
     for clusters in (4, 64):
         mip = make(clusters=clusters)
         actual = density(mip, round_footprint(mip, uv, sigma), normals)
-        errors.append(relative_l1(actual, sum_of_texels(mip, uv, sigma, normals)))
+        errors.append(suite.relative_l1(actual, sum_of_texels(mip, uv, sigma, normals)))
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -139,7 +136,7 @@ def test_density_is_continuous_over_levels(variant):
             density(mip, round_footprint(mip, uv, sigma * f), normals) for f in (0.9999, 1.0001)
         )
         # The footprint itself grows by 2e-4
-        assert relative_l1(just_below, just_above) < 5e-3
+        assert suite.relative_l1(just_below, just_above) < 5e-3
 
 
 def test_mirrored_maps_are_mirrored(variant):
@@ -153,13 +150,18 @@ def test_mirrored_maps_are_mirrored(variant):
             )
             for side in (1, -1)
         )
-        assert relative_l1(density(mip, beyond, normals), density(mip, inside, normals)) < 1e-3
+        assert (
+            suite.relative_l1(density(mip, beyond, normals), density(mip, inside, normals)) < 1e-3
+        )
 
 
 def test_clamped_footprints_stay_inside(variant):
     mip, normals = make(NormalMap(SAMPLE.normals, "clamp")), grid()
     outside = density(mip, round_footprint(mip, (1.7, -0.4), 3.0), normals)
-    assert relative_l1(outside, density(mip, round_footprint(mip, (1.0, 0.0), 3.0), normals)) < 1e-5
+    assert (
+        suite.relative_l1(outside, density(mip, round_footprint(mip, (1.0, 0.0), 3.0), normals))
+        < 1e-5
+    )
 
 
 @pytest.mark.parametrize(
