@@ -456,11 +456,6 @@ def test_furnace_on_average(variant, name):
         assert (weight.mean(axis=1) <= 1 + 3 * weight.std(axis=1) / np.sqrt(count)).all()
 
 
-@pytest.mark.parametrize("key", ["alpha_u", "alpha_v", "intensity", "specular_reflectance.value"])
-def test_derivatives(variant, key):
-    suite.check_derivative(load(specular_reflectance=0.5), RESOLVED, key)
-
-
 def test_derivative_of_the_mean(variant):
     def mean_density(alpha):
         grid.alpha_u = alpha

@@ -154,11 +154,6 @@ def test_furnace_from_above(variant):
             suite.check_furnace(load(**parameters), above, View())
 
 
-@pytest.mark.parametrize("key", ["alpha_u", "alpha_v", "micro_alpha", "specular_reflectance.value"])
-def test_derivatives(variant, key):
-    suite.check_derivative(load(specular_reflectance=0.5, density=6.0), RESOLVED, key)
-
-
 def test_each_variant(each_variant):
     si = scattered(200, 1, 1.0)
     for colors in ("none", "wheel"):

@@ -1,8 +1,9 @@
-"""Derivatives of images with respect to the parameters of a BSDF, against differences of images.
+"""Derivatives with respect to the parameters of a BSDF, against differences.
 
-Two modes of automatic differentiation agree on a graph that is wrong. So what counts is the image:
+Two modes of automatic differentiation agree on a graph that is wrong. And what counts is the image:
 :func:`render_derivatives` renders a plate under a lamp, by any integrator, and compares what
 ``mi.render`` returns with central differences of the same random numbers.
+:func:`check_value_derivatives` does so with values of a BSDF, for settings that have no image here.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf import maps
+from glintbsdf.check.suite import View, intensity, random_numbers
 from glintbsdf.core.alignment import aligned
 
 #: Relative step of central differences.
@@ -147,23 +149,28 @@ def plate(bsdf: dict, integrator: str = "prb", lamp: str = "point", size: int = 
 
 
 class Grown:
-    """Parameters of a scene, all values of each times a factor.
+    """Parameters, all values of each times a factor.
 
     Attributes:
-        names (dict): what ``mi.traverse`` of the scene calls each key.
+        names (dict): what ``params`` calls each key.
     """
 
-    def __init__(self, scene: mi.Scene, keys: Sequence[str]) -> None:
-        self.params = mi.traverse(scene)
-        known = list(self.params.keys())
-        self.names = {}
+    def __init__(self, params: mi.SceneParameters, names: dict[str, str]) -> None:
+        self.params, self.names = params, names
+        self.start = {key: np.array(self.params[name]) for key, name in names.items()}
+        self.now: dict[str, tuple] = {}
+
+    @staticmethod
+    def of_plate(scene: mi.Scene, keys: Sequence[str]) -> Grown:
+        """Parameters of the BSDF of a :func:`plate`."""
+        params = mi.traverse(scene)
+        known, names = list(params.keys()), {}
         for key in keys:
             found = [n for n in known if n.startswith("plate.") and n.endswith("." + key)]
             if len(found) != 1:
                 raise ValueError(f'"{key}" must be a parameter of the BSDF (got {known})')
-            self.names[key] = found[0]
-        self.start = {key: np.array(self.params[name]) for key, name in self.names.items()}
-        self.now: dict[str, tuple] = {}
+            names[key] = found[0]
+        return Grown(params, names)
 
     def values(self, key: str, factor: float) -> object:
         """The values of a parameter, in its own type."""
@@ -183,6 +190,13 @@ class Grown:
                 dr.enable_grad(self.params[name])
         self.params.update()
 
+    def gradients(self) -> dict[str, float]:
+        """The derivatives that the parameters have received, per relative change."""
+        return {
+            key: float((np.array(dr.grad(self.params[name])).reshape(start.shape) * start).sum())
+            for (key, name), start in zip(self.names.items(), self.start.values(), strict=True)
+        }
+
 
 class Picture:
     """A picture of a plate, summed to one number.
@@ -197,7 +211,7 @@ class Picture:
 
     def __init__(self, description: dict, keys: Sequence[str], spp: int) -> None:
         self.scene = mi.load_dict(description)
-        self.grown, self.spp = Grown(self.scene, keys), spp
+        self.grown, self.spp = Grown.of_plate(self.scene, keys), spp
         self.grown.set(1, False)
         weights = mi.render(self.scene, spp=4 * spp, seed=0)
         self.weights = dr.detach(weights / dr.mean(weights, axis=None))
@@ -221,12 +235,7 @@ class Picture:
         """The derivatives with respect to all parameters, per relative change."""
         self.grown.set(1 + 1e-4 * seed, True)  # other values, as steps of an optimisation have
         dr.backward(self.sum(seed, self.grown.params))
-        params, names = self.grown.params, self.grown.names
-        gradients = {key: dr.grad(params[name]) for key, name in names.items()}
-        return [
-            float((np.array(gradients[key]).reshape(start.shape) * start).sum())
-            for key, start in self.grown.start.items()
-        ]
+        return list(self.grown.gradients().values())
 
     def forward(self, seed: int) -> list[float]:
         """The sum of :meth:`reverse`, in forward mode."""
@@ -318,3 +327,35 @@ def check_render_derivatives(
         clear = derivative.noise <= resolution * abs(derivative.difference)
         assert clear, f"{integrator}, too noisy: {derivative}"
         assert derivative.compiled == 0, f"{integrator}: {derivative}"
+
+
+def check_value_derivatives(bsdf: mi.BSDF, view: View, *keys: str, count: int = 5000) -> None:
+    """Derivatives of the mean of ``count`` values of a BSDF are those of central differences.
+
+    The places lie all over the map, and the directions are samples of the BSDF there. Values jump
+    where the edge of a footprint crosses a texel, so that derivatives are right on average. The
+    error allowed is a share of the derivative, and of three standard errors of its mean over
+    places. These must not be much larger than the derivative.
+    """
+    si, u = view.interaction(count), random_numbers(count, 5, seed=7)
+    si.uv = mi.Point2f(u[3], u[4])
+    bs, _ = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
+    wo = dr.detach(bs.wo)
+    grown = Grown(mi.traverse(bsdf), {key: key for key in keys})
+
+    def values() -> mi.Float:
+        return dr.mean(intensity(bsdf.eval(mi.BSDFContext(), si, wo)), axis=0)
+
+    grown.set(1, True)
+    dr.backward(dr.mean(values()))
+    gradients = grown.gradients()
+    for key in keys:
+        ends = []
+        for factor in (1 + STEP, 1 - STEP):
+            grown.set(1, False, **{key: factor})
+            ends.append(values().numpy().astype(np.float64))
+        slopes = (ends[0] - ends[1]) / (2 * STEP)
+        expected, noise = slopes.mean(), 3 * slopes.std() / np.sqrt(count)
+        told = f"{key}: {gradients[key]:.4g}, central differences {expected:.4g}, noise {noise:.2g}"
+        assert abs(gradients[key] - expected) <= ERROR * (abs(expected) + noise), told
+        assert noise <= 3 * abs(expected), f"too noisy: {told}"

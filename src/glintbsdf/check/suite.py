@@ -411,32 +411,6 @@ def check_furnace(bsdf: mi.BSDF, *views: View, count: int = 20_000) -> None:
     assert (weight.mean(axis=1) <= 1 + 3 * noise + 1e-6).all()
 
 
-def check_derivative(bsdf: mi.BSDF, view: View, key: str, count: int = 50) -> None:
-    """Forward and reverse derivatives of ``eval`` with respect to a parameter agree, and exist.
-
-    Both are taken along the direction in which every entry of the parameter grows alike.
-    """
-    si, bs, _ = sample(bsdf, view, count)
-    wo = dr.detach(bs.wo)
-    params = mi.traverse(bsdf)
-
-    def value() -> mi.Float:
-        dr.enable_grad(params[key])
-        params.update()
-        return dr.sum(intensity(bsdf.eval(mi.BSDFContext(), si, wo)), axis=None)
-
-    total = value()
-    dr.backward(total)
-    reverse = dr.sum(dr.grad(params[key]), axis=None)
-    params[key] = dr.detach(params[key])
-    total = value()
-    dr.forward(params[key])
-    forward = dr.grad(total)
-    assert dr.isfinite(reverse) and reverse != 0
-    # The two modes sum the same float32 terms of either sign in different orders.
-    assert dr.allclose(forward, reverse, rtol=1e-3), (forward, reverse)
-
-
 # --------------------------------------------------------------------------------------------------
 #  Lights: the spread and the turn of a query
 # --------------------------------------------------------------------------------------------------

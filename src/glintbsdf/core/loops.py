@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from functools import partial
+from functools import cache, partial
 from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -105,25 +105,57 @@ class Captured:
         self.function = function
         self.values: list = []
         self.places: dict[tuple[int, int], int] = {}
-
-        def find(array):
-            computed = array.state != dr.VarState.Evaluated
-            if computed and dr.grad_enabled(array) and identity(array) not in self.places:
-                self.places[identity(array)] = len(self.values)
-                self.values.append(array)
-            return array
-
+        #: What holds one of the arrays, by identity; kept alive, so that no identity is used again.
+        self.holders: dict[int, object] = {}
         if derivatives_exist():
-            mapped(function, find, {})
+            self.find(function, {})
+
+    def find(self, thing: Any, done: dict[int, tuple[object, bool]]) -> bool:
+        """Whether ``thing`` is one of the arrays, or holds one. ``done``: the answers so far, by
+        identity, each with its object."""
+        if id(thing) in done:
+            return done[id(thing)][1]
+        done[id(thing)] = thing, False
+        way = way_into(thing.__class__)
+        if way is None:
+            return False
+        if way is ARRAY:
+            held = thing.state != dr.VarState.Evaluated and dr.grad_enabled(thing)
+            if held and identity(thing) not in self.places:
+                self.places[identity(thing)] = len(self.values)
+                self.values.append(thing)
+        else:
+            held = False
+            for part in way(thing)[0]:
+                held |= self.find(part, done)
+        if held:
+            self.holders[id(thing)] = thing
+            done[id(thing)] = thing, True
+        return held
 
     def function_with(self, values) -> Callable:
         """A copy of the function that uses ``values`` in place of the captured arrays."""
+        return self.replaced(self.function, values, {})
 
-        def replace(array):
-            place = self.places.get(identity(array))
-            return array if place is None else values[place]
-
-        return mapped(self.function, replace, {})
+    def replaced(self, thing: Any, values, done: dict[int, tuple[object, object]]) -> Any:
+        """``thing`` with ``values`` in place of the arrays in it; itself if it holds none. ``done``
+        has the objects met so far, and their replacements, by identity."""
+        way = way_into(thing.__class__)
+        if way is ARRAY:
+            place = self.places.get(identity(thing))
+            return thing if place is None else values[place]
+        # Each look into a vector, or into an interaction of Mitsuba, makes new parts.
+        lasting = way is not into_vector and type(way) is not partial
+        if way is None or (lasting and id(thing) not in self.holders):
+            return thing
+        if id(thing) not in done:
+            # While an object is alive, no other gets its identity.
+            done[id(thing)] = thing, thing
+            parts, remade = way(thing)
+            new = [self.replaced(part, values, done) for part in parts]
+            if any(a is not b for a, b in zip(new, parts, strict=True)):
+                done[id(thing)] = thing, remade(new)
+        return done[id(thing)][1]
 
 
 def identity(array) -> tuple[int, int]:
@@ -136,58 +168,63 @@ def identity(array) -> tuple[int, int]:
 # ------------------------------------------------------------------------------------------------
 
 
-def mapped(thing: Any, replace: Callable, done: dict) -> Any:
-    """``thing`` with ``replace`` applied to all arrays in it: itself if none changes, else a copy.
-
-    It looks into containers, functions and their enclosing variables, objects and their attributes.
-    ``done`` maps the identity of each object met so far to the object and its replacement.
-    """
-    if id(thing) in done:
-        return done[id(thing)][1]
-    done[id(thing)] = thing, thing  # while the first is alive, no other object gets its identity
-    if dr.is_array_v(thing) and dr.depth_v(thing) == 1 and not dr.is_tensor_v(thing):
-        result = replace(thing)
-    else:
-        parts, remade = taken_apart(thing)
-        new = [mapped(part, replace, done) for part in parts]
-        unchanged = all(a is b for a, b in zip(new, parts, strict=True))
-        result = thing if unchanged else remade(new)
-    done[id(thing)] = thing, result
-    return result
-
-
-def taken_apart(thing: Any) -> tuple[list, Callable]:
-    """The parts of an object, and a function that makes a copy of it with other parts."""
-    kind = type(thing)
-    if dr.is_array_v(thing):
-        parts = [] if dr.is_tensor_v(thing) else list(thing)
-        return parts, lambda new: with_items(kind(thing), enumerate(new))
-    if isinstance(thing, tuple | list):
-        return list(thing), getattr(kind, "_make", kind)
-    if kind is dict:
-        return list(thing.values()), lambda new: dict(zip(thing, new, strict=True))
-    if kind is MethodType:
-        return [thing.__self__], lambda new: MethodType(thing.__func__, *new)
-    if kind is partial:
-        return [thing.func, thing.args, thing.keywords], lambda new: partial(
-            new[0], *new[1], **new[2]
-        )
-    if kind is FunctionType:
-        return function_taken_apart(thing)
+@cache
+def way_into(kind: type) -> Callable | None:
+    """How to look into objects of a type: a function that returns an object's parts, and a function
+    that makes a copy of it with other parts. :func:`ARRAY` for arrays of one dimension, None for
+    what has no parts."""
+    if dr.is_array_v(kind):
+        if dr.is_tensor_v(kind):
+            return None
+        return ARRAY if dr.depth_v(kind) == 1 else into_vector
+    if issubclass(kind, tuple | list):
+        return into_list
     fields = getattr(kind, "DRJIT_STRUCT", None)  # Mitsuba's interactions, for example, have it
-    if fields and not isinstance(thing, type):
-        parts = [getattr(thing, name) for name in fields]
-        return parts, lambda new: with_attributes(kind(thing), zip(fields, new, strict=True))
-    if keeps_attributes(thing):
-        names = list(vars(thing))
-        return list(vars(thing).values()), lambda new: with_attributes(
-            copy(thing), zip(names, new, strict=True)
-        )
-    return [], lambda new: thing
+    if fields and not issubclass(kind, type):
+        return partial(into_attributes, fields=tuple(fields))
+    return WAYS.get(kind) or (into_object if keeps_attributes(kind) else None)
 
 
-def function_taken_apart(function: FunctionType) -> tuple[list, Callable]:
-    """The default arguments and enclosing variables of a function; see :func:`taken_apart`."""
+def ARRAY(array: Any) -> tuple[list, Callable]:  # noqa: N802
+    """Stands for arrays of one dimension, which have no parts."""
+    return [], lambda new: array
+
+
+def into_vector(vector: Any) -> tuple[list, Callable]:
+    kind = type(vector)
+    return list(vector), lambda new: with_items(kind(vector), enumerate(new))
+
+
+def into_list(values: tuple | list) -> tuple[list, Callable]:
+    return list(values), getattr(type(values), "_make", type(values))
+
+
+def into_dict(table: dict) -> tuple[list, Callable]:
+    return list(table.values()), lambda new: dict(zip(table, new, strict=True))
+
+
+def into_method(method: MethodType) -> tuple[list, Callable]:
+    return [method.__self__], lambda new: MethodType(method.__func__, *new)
+
+
+def into_partial(thing: partial) -> tuple[list, Callable]:
+    return [thing.func, thing.args, thing.keywords], lambda new: partial(new[0], *new[1], **new[2])
+
+
+def into_attributes(thing: Any, fields: tuple[str, ...]) -> tuple[list, Callable]:
+    parts, kind = [getattr(thing, name) for name in fields], type(thing)
+    return parts, lambda new: with_attributes(kind(thing), zip(fields, new, strict=True))
+
+
+def into_object(thing: Any) -> tuple[list, Callable]:
+    names = list(vars(thing))
+    return list(vars(thing).values()), lambda new: with_attributes(
+        copy(thing), zip(names, new, strict=True)
+    )
+
+
+def into_function(function: FunctionType) -> tuple[list, Callable]:
+    """The default arguments and enclosing variables of a function; see :func:`way_into`."""
     cells = [cell for cell in function.__closure__ or () if is_set(cell)]
 
     def remade(new):
@@ -219,13 +256,13 @@ def is_set(cell: CellType) -> bool:
     return True
 
 
-def keeps_attributes(thing: object) -> bool:
-    """Whether the whole state of an object is in its Python attributes. This is not so for plugins
-    of Mitsuba, which have a part in C++, nor for classes and modules."""
+def keeps_attributes(kind: type) -> bool:
+    """Whether the whole state of objects of a type is in their Python attributes. This is not so
+    for plugins of Mitsuba, which have a part in C++, nor for classes and modules."""
     return (
-        hasattr(thing, "__dict__")
-        and not isinstance(thing, type | ModuleType)
-        and not any(base.__module__.startswith("mitsuba") for base in type(thing).__mro__)
+        kind.__dictoffset__ != 0
+        and not issubclass(kind, type | ModuleType)
+        and not any(base.__module__.startswith("mitsuba") for base in kind.__mro__)
     )
 
 
@@ -241,3 +278,12 @@ def with_attributes(thing, attributes):
     for name, value in attributes:
         object.__setattr__(thing, name, value)
     return thing
+
+
+#: How to look into objects of these types; see :func:`way_into`.
+WAYS: dict[type, Callable] = {
+    dict: into_dict,
+    MethodType: into_method,
+    partial: into_partial,
+    FunctionType: into_function,
+}

@@ -230,6 +230,11 @@ class TexelKernel:
         height = self.peak * exp(-0.5 * self.cut**2) if gaussian else self.peak
         return value + height * without_value(ramp((self.cut**2 - rho2) * (1 / self.edge)))
 
+    def counts(self, weight, active):
+        """Where ``active`` and a weight from :meth:`value`, or its derivative, is not 0: beyond the
+        kernel's edge weights are 0, but the edge may move there."""
+        return active if self.edge else active & (weight > 0)
+
     def sample(self, sample):
         """Draw an offset Δ (texels) with density k from ``sample`` in [0, 1)²."""
         reach = self.cut

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from math import ceil, exp, inf, pi, sqrt
+from math import ceil, exp, inf, log2, pi, sqrt
 
 import drjit as dr
 import mitsuba as mi
@@ -76,9 +76,14 @@ MIN_SIGMA_R, MAX_SIGMA_R = 1e-8, 1.0
 MAX_SEEDS = 4
 
 #: The lists of elements serve while the variance that the light's spread and the half vector's turn
-#: add is at most this multiple of the variance of an element's own normals. The lists then miss
-#: less than 1 % of the mass of most maps.
-LISTS_SPREAD = 3.0
+#: add is at most this multiple of the variance that the lists allow the median element. The lists
+#: then miss less than 1 % of the mass.
+LISTS_SPREAD = 2.0
+
+#: The lists for lights allow flat elements this share of the variance by which the mean element
+#: exceeds the median one. On maps that are flat between edges, merged elements blur by the mean
+#: variance, so the lists serve up to lights about as wide as this.
+FLAT_SHARE = 0.4
 
 #: Memory allowed to the lists, in bytes per cell: with one seed per cell, and with several. The
 #: whole structure then takes less memory than the paper reports.
@@ -387,7 +392,9 @@ class Mixture(PNDF):
 
     def listed_roughness(self) -> mi.Float:
         """The roughness that the lists are built for."""
-        return dr.maximum(self.sigma_r, self.listed) if self.listed else self.sigma_r
+        if not self.listed:
+            return self.sigma_r
+        return dr.maximum(self.sigma_r, opaque(mi.Float, self.listed))
 
     def uses_merged(self, query: Query, small: mi.Bool) -> mi.Bool:
         """Whether merged elements answer the query: the light's spread and the half vector's turn
@@ -402,10 +409,16 @@ class Mixture(PNDF):
             footprint = query.footprint
             for axis in (footprint.du, footprint.dv):
                 variance = variance + dr.squared_norm(query.turn @ axis)
-        # ``variance`` and ``slope`` are of both components together, ``own`` is of one.
-        curved = 0.5 * self.levels.slope**2 * self.variance / SIGMA_H**2
-        own = dr.square(self.listed_roughness()) + opaque(mi.Float, curved)
+        # ``variance`` is of both components together, ``own`` is of one.
+        own = dr.square(self.listed_roughness()) + opaque(
+            mi.Float, self.curved_variance(self.levels.median_slope)
+        )
         return ~small & (variance > 2 * LISTS_SPREAD * own)
+
+    def curved_variance(self, slope: float) -> float:
+        """Variance of each component of the normals of an element, by the slope of
+        :class:`~.Levels`, which is that of both components together."""
+        return 0.5 * slope**2 * self.variance / SIGMA_H**2
 
     def _sample(
         self, query: Query, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
@@ -657,8 +670,14 @@ class Elements(Mixture):
     def prepare_for_lights(self) -> None:
         if self.levels is None:
             self.levels = Levels(self.data, self.wrap_mode)
-        if self.normal_reach < LIGHT_REACH:
-            self.normal_reach = LIGHT_REACH
+        mean, median = (
+            self.curved_variance(slope) for slope in (self.levels.slope, self.levels.median_slope)
+        )
+        flat = sqrt(self.sigma_r[0] ** 2 + FLAT_SHARE * max(mean - median, 0))
+        # In steps, so that small changes of the map keep it.
+        listed = max(self.listed, 2 ** (round(2 * log2(flat)) / 2))
+        if (self.normal_reach, self.listed) != (LIGHT_REACH, listed):
+            self.normal_reach, self.listed = LIGHT_REACH, listed
             if self.lists is not None:
                 self.lists = self.make_lists()
 

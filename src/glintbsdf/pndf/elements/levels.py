@@ -81,6 +81,9 @@ MARGIN = 4.5
 #: Variance added to the residual covariance of merged elements, well above its rounding errors.
 ROUNDING = 1e-7
 
+#: The median is taken of this many texels.
+MEDIAN_TEXELS = 1 << 16
+
 #: Indices of the components of a symmetric 2×2 matrix.
 PAIRS = (0, 0), (0, 1), (1, 1)
 
@@ -126,6 +129,8 @@ class Levels:
 
     Attributes:
         slope (float): standard deviation of the normals within a texel's Gaussian, over the map.
+        median_slope (float): the same of the median texel. It is far below ``slope`` if most of the
+            map is flat between edges.
         lower, upper (mi.Vector2f): bounds of the map's normals.
         nbytes (int): memory, bytes.
     """
@@ -136,6 +141,7 @@ class Levels:
         base = finest_level(data, wrap_mode)
         variance = sum(dr.mean(x * x + y * y) for x, y in (base.nx, base.ny))
         self.slope = max(float(np.sqrt(variance[0])) / SIGMA_H, 1e-12)
+        self.median_slope = float(np.sqrt(median_square(*base.nx, *base.ny))) / SIGMA_H
         x, y = base.n
         self.lower, self.upper = (
             mi.Vector2f(dr.detach(extreme(x)), dr.detach(extreme(y)))
@@ -302,6 +308,16 @@ class Levels:
 # ------------------------------------------------------------------------------------------------
 #  Building
 # ------------------------------------------------------------------------------------------------
+
+
+def median_square(*components: mi.Float) -> float:
+    """The median of the squared lengths of vectors, over at most :data:`MEDIAN_TEXELS` of them."""
+    count = dr.width(components[0])
+    stride = -(-count // MEDIAN_TEXELS)
+    index = mi.UInt32(np.arange(0, count, stride, dtype=np.uint32))
+    return float(
+        np.median(sum(dr.square(dr.gather(mi.Float, dr.detach(v), index)) for v in components))
+    )
 
 
 def form_of_adjoint(xx: mi.Float, xy: mi.Float, yy: mi.Float, d: mi.Vector2f) -> mi.Float:

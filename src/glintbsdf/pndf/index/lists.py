@@ -194,7 +194,7 @@ class NormalCells:
     @staticmethod
     def histogram(normals, lower, upper) -> np.ndarray:
         """Number of ``normals`` (``mi.Float``, x and y by turns) in each pixel of the tables: an
-        array over x and y."""
+        array over x and y, whose row i is the sum of the rows of pixels before i."""
         count = dr.arange(mi.UInt32, dr.width(normals) // 2)
         scale = (RESOLUTION / (upper - lower)).astype(np.float32)
         pixel = []
@@ -204,11 +204,13 @@ class NormalCells:
             pixel.append(mi.UInt32(dr.clip(place, 0, RESOLUTION - 1)))
         counts = dr.zeros(mi.UInt32, RESOLUTION**2)
         dr.scatter_add(counts, mi.UInt32(1), pixel[0] * RESOLUTION + pixel[1])
-        return counts.numpy().reshape(RESOLUTION, RESOLUTION)
+        sums = np.zeros((RESOLUTION + 1, RESOLUTION), np.uint32)
+        np.cumsum(counts.numpy().reshape(RESOLUTION, RESOLUTION), axis=0, out=sums[1:])
+        return sums
 
     @staticmethod
     def tables(histogram: np.ndarray, divisions: int):
-        """The tables ``(slab_of_x, cell_of_y)`` for normals with this histogram."""
+        """The tables ``(slab_of_x, cell_of_y)`` for normals with this :meth:`histogram`."""
 
         def cut(counts):
             mass = np.cumsum(counts) / max(counts.sum(), 1)
@@ -216,9 +218,8 @@ class NormalCells:
             before = 0.5 * (np.append(0, mass[:-1]) + np.append(0, uniform[:-1]))
             return np.minimum(before * divisions, divisions - 1).astype(np.uint8)
 
-        slab_of_x = cut(histogram.sum(1))
-        slabs = np.zeros((divisions, RESOLUTION), np.int64)
-        np.add.at(slabs, slab_of_x, histogram)
+        slab_of_x = cut(np.diff(histogram.sum(1)))
+        slabs = np.diff(histogram[np.searchsorted(slab_of_x, np.arange(divisions + 1))], axis=0)
         return slab_of_x, np.stack([cut(counts) for counts in slabs])
 
     def pixel(self, value, axis):

@@ -463,7 +463,7 @@ class ProjectedArea(FootprintArea):
             triangles = self.triangles(row, column, active)
             for triangle, centroid in zip(triangles, (1 / 3, 2 / 3), strict=True):
                 weight = dr.select(active, triangle_weight(kernel, corner, centroid), 0)
-                counts = active & (weight > 0)
+                counts = kernel.counts(weight, active)
                 seen = [self.triangle(triangle, w, counts) for w in directions]
                 areas = [dr.fma(weight, x, area) for x, area in zip(seen, areas, strict=True)]
                 slope = slope + weight * mean_slope(*triangle)

@@ -273,7 +273,8 @@ class TabulatedManifold(Manifold):
             masses, weights = mi.Float(0), mi.Float(0)
             for weight, y, x, active in nodes:
                 y, x = (wrapped(*v) for v in ((y, count_y), (x, count_x)))
-                masses += weight * tables.value(table, y, x, active & (weight > 0))
+                counts = kernel.counts(weight, active)
+                masses += weight * tables.value(table, y, x, counts)
                 weights += weight
             return mass + masses, total + weights
 
