@@ -21,7 +21,7 @@ from benchmarks.harness import Run, family, seconds, seconds_in_turn
 from benchmarks.methods import METHODS, Method
 from glintbsdf import Footprint, NormalMap
 from glintbsdf.check import suite
-from glintbsdf.core.loops import mapped
+from glintbsdf.core.loops import arrays_in
 
 #: Standard deviations of footprints, texels; width and height of the picture of Tan22.
 SIGMAS, FULL_HD = (1.3, 10.0), (1920, 1080)
@@ -111,8 +111,7 @@ def agreement(run: Run) -> None:
 def frozen(pndf, m: mi.Vector2f, footprint: Footprint) -> Callable:
     """``pndf.eval(m, footprint)`` as a frozen function of these arrays, recorded once."""
     dr.eval(pndf.eval(m, footprint))  # whatever is made at the first use
-    arrays: list = []
-    mapped(pndf, lambda array: arrays.append(array) or array, {})
+    arrays = arrays_in(pndf)
 
     @dr.freeze(state_fn=lambda *_: arrays)
     def evaluate(m, uv, du, dv):

@@ -105,33 +105,16 @@ class Captured:
         self.function = function
         self.values: list = []
         self.places: dict[tuple[int, int], int] = {}
-        #: What holds one of the arrays, by identity; kept alive, so that no identity is used again.
-        self.holders: dict[int, object] = {}
-        if derivatives_exist():
-            self.find(function, {})
 
-    def find(self, thing: Any, done: dict[int, tuple[object, bool]]) -> bool:
-        """Whether ``thing`` is one of the arrays, or holds one. ``done``: the answers so far, by
-        identity, each with its object."""
-        if id(thing) in done:
-            return done[id(thing)][1]
-        done[id(thing)] = thing, False
-        way = way_into(thing.__class__)
-        if way is None:
-            return False
-        if way is ARRAY:
-            held = thing.state != dr.VarState.Evaluated and dr.grad_enabled(thing)
-            if held and identity(thing) not in self.places:
-                self.places[identity(thing)] = len(self.values)
-                self.values.append(thing)
-        else:
-            held = False
-            for part in way(thing)[0]:
-                held |= self.find(part, done)
-        if held:
-            self.holders[id(thing)] = thing
-            done[id(thing)] = thing, True
-        return held
+        def is_captured(array) -> bool:
+            if array.state == dr.VarState.Evaluated or not dr.grad_enabled(array):
+                return False
+            if identity(array) not in self.places:
+                self.places[identity(array)] = len(self.values)
+                self.values.append(array)
+            return True
+
+        self.holders = holders_of(function, is_captured) if derivatives_exist() else {}
 
     def function_with(self, values) -> Callable:
         """A copy of the function that uses ``values`` in place of the captured arrays."""
@@ -166,6 +149,46 @@ def identity(array) -> tuple[int, int]:
 # ------------------------------------------------------------------------------------------------
 #  Traversal of everything that a function refers to
 # ------------------------------------------------------------------------------------------------
+
+
+def arrays_in(thing: Any) -> list:
+    """All arrays of one dimension that a thing refers to."""
+    arrays: list = []
+
+    def add(array) -> bool:
+        arrays.append(array)
+        return True
+
+    holders_of(thing, add)
+    return arrays
+
+
+def holders_of(thing: Any, is_wanted: Callable[[Any], bool]) -> dict[int, object]:
+    """All objects that are or hold a wanted array, by identity.
+
+    It looks into containers, functions and their enclosing variables, objects and their attributes.
+    The objects are kept alive, so that no other object gets the identity of one of them.
+    """
+    holders: dict[int, object] = {}
+    met: dict[int, object] = {}
+
+    def holds(thing: Any) -> bool:
+        if id(thing) in met:
+            return id(thing) in holders
+        met[id(thing)] = thing
+        way = way_into(thing.__class__)
+        if way is None:
+            return False
+        if way is ARRAY:
+            found = is_wanted(thing)
+        else:
+            found = any([holds(part) for part in way(thing)[0]])
+        if found:
+            holders[id(thing)] = thing
+        return found
+
+    holds(thing)
+    return holders
 
 
 @cache
