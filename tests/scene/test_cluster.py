@@ -66,7 +66,7 @@ def image(job: Job, cluster: Cluster | None, render_all=None, **options) -> np.n
 
 
 def pids(cluster: Cluster) -> list[int]:
-    return list(cluster.client.run(os.getpid).values())
+    return list(cluster.client.run(os.getpid, on_error="ignore").values())
 
 
 # ---------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import os
 import pickle
 import signal
@@ -157,7 +158,7 @@ def work(expected: dict[str, str], task: bytes) -> Answer:
     if difference is not None:
         raise ClusterError(f"the worker {worker.address} has {difference}")
     job, unit = pickle.loads(task)
-    with _lock:
+    with _lock, _without_collection():
         store = Store(Path(worker.local_directory) / "glintbsdf-files")
         missing = job.package.missing(store) if job not in _loaded else []
         if missing:
@@ -193,6 +194,8 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
     while len(_loaded) >= SCENES:
         _, (_, stack) = _loaded.popitem(last=False)
         stack.close()
+        del stack
+        gc.collect()
     if job.variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise ClusterError(f"{job.variant} needs an NVIDIA GPU, and a worker has none")
     if mi.variant() != job.variant:
@@ -206,6 +209,17 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
         renderer = stack.enter_context(Renderer(scene, job.spp, job.denoise, missed, job.sensor))
         _loaded[job] = renderer, stack.pop_all()
     return renderer
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """A context without garbage collection. Otherwise another thread of Dask may destroy a former
+    scene while this one records a kernel, and Dr.Jit calls shapes that are half destroyed."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 @contextlib.contextmanager

@@ -78,7 +78,7 @@ MAX_SEEDS = 4
 #: The lists of elements serve while the variance that the light's spread and the half vector's turn
 #: add is at most this multiple of the variance that the lists allow the median element. The lists
 #: then miss less than 1 % of the mass.
-LISTS_SPREAD = 2.0
+LISTS_SPREAD = 3.0
 
 #: The lists for lights allow flat elements this share of the variance by which the mean element
 #: exceeds the median one. On maps that are flat between edges, merged elements blur by the mean
