@@ -170,25 +170,29 @@ def holders_of(thing: Any, is_wanted: Callable[[Any], bool]) -> dict[int, object
     The objects are kept alive, so that no other object gets the identity of one of them.
     """
     holders: dict[int, object] = {}
-    met: dict[int, object] = {}
-
-    def holds(thing: Any) -> bool:
-        if id(thing) in met:
-            return id(thing) in holders
-        met[id(thing)] = thing
-        way = way_into(thing.__class__)
-        if way is None:
-            return False
-        if way is ARRAY:
-            found = is_wanted(thing)
-        else:
-            found = any([holds(part) for part in way(thing)[0]])
-        if found:
-            holders[id(thing)] = thing
-        return found
-
-    holds(thing)
+    holds(thing, is_wanted, {}, holders)
     return holders
+
+
+def holds(thing: Any, is_wanted: Callable[[Any], bool], met: dict, holders: dict) -> bool:
+    """Whether ``thing`` is or holds a wanted array; then it is added to ``holders``, as everything
+    inside of it that does. ``met`` has the objects met so far, by identity.
+
+    This is no function within another one: that would refer to itself, and keep all arrays alive.
+    """
+    if id(thing) in met:
+        return id(thing) in holders
+    met[id(thing)] = thing
+    way = way_into(thing.__class__)
+    if way is None:
+        return False
+    if way is ARRAY:
+        found = is_wanted(thing)
+    else:
+        found = any([holds(part, is_wanted, met, holders) for part in way(thing)[0]])
+    if found:
+        holders[id(thing)] = thing
+    return found
 
 
 @cache
