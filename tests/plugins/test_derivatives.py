@@ -12,6 +12,7 @@ import pytest
 from glintbsdf import Footprint
 from glintbsdf.check.derivatives import (
     INTEGRATORS,
+    STEP,
     check_render_derivatives,
     examples,
     render_derivatives,
@@ -42,6 +43,31 @@ def test_derivatives_of_an_image(variant, name):
     noisy = {"elements, lamp": 0.15, "manifold, map": 0.3, "grid": 0.15}
     resolution = noisy.get(name, 0.05)
     check_render_derivatives(plate, keys, "prb", resolution, **settings)
+
+
+# Other methods of the same plugins: the example, what differs, and the parameters.
+VARIATIONS = [
+    *(
+        ("lean", {"method": m}, ("alpha", "data"))
+        for m in ("toksvig", "variance", "clean", "leadr")
+    ),
+    ("elements", {"elements": "flat"}, ("sigma_r", "footprint_sigma", "data")),
+    ("elements", {"step": 0.7}, ("sigma_r", "footprint_sigma", "data")),
+    ("diffuse", {"method": "oren_nayar"}, ("data", "reflectance.value")),
+]
+
+
+@pytest.mark.parametrize("name, settings, keys", VARIATIONS)
+def test_derivatives_of_other_methods(variant, name, settings, keys):
+    check_render_derivatives(two_sided(bsdf(name, **settings)), keys, "prb", 0.05)
+
+
+def test_the_example_of_tables_uses_tables(variant):
+    tables = mi.load_dict(bsdf("tables"))
+    sigma = 0.5 * 3 * tables.pixel_spread * tables.footprint_sigma  # of a plate of 2 units, 3 away
+    for factor in (1 - STEP, 1 + STEP):
+        level = tables.pndf.level(Footprint.isotropic(mi.Point2f(0.5), sigma * factor))
+        assert dr.all(level >= 0)
 
 
 # Masking is left out where it is not what differs.

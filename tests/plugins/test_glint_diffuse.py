@@ -11,7 +11,6 @@ import pytest
 
 from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check import suite
-from glintbsdf.check.derivatives import check_value_derivatives
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.pndf.manifold.diffuse import oren_nayar
 
@@ -181,12 +180,6 @@ def test_sampling_is_by_the_cosine(variant):
     z = np.array(bs.wo.z)
     assert z.mean() == pytest.approx(2 / 3, abs=4 * np.sqrt(1 / 18 / len(z)))
     assert z.var() == pytest.approx(1 / 18, rel=0.05)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_derivatives(variant, method):
-    bsdf = load(MAPS["isotropic"], method=method)
-    check_value_derivatives(bsdf, RESOLVED, "data", "footprint_sigma", "reflectance.value")
 
 
 def test_albedo_and_description(variant):

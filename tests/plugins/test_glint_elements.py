@@ -12,7 +12,6 @@ import pytest
 
 from glintbsdf import NormalMap, maps
 from glintbsdf.check import suite
-from glintbsdf.check.derivatives import check_value_derivatives
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 
 SIGMA_R = 0.01
@@ -118,14 +117,6 @@ def test_furnace(variant, kind):
     for wi in ((0, 0, 1), (1, 0, 1), (0, 1, 0.3), (1, 1, 0.1)):
         suite.check_furnace(bsdf, replace(VIEWS["small"], wi=wi))
         suite.check_furnace(bsdf, replace(EXTREME_VIEWS["one_map"], wi=wi), count=2000)
-
-
-# Images have those of curved elements, of flakes, and of masking.
-@pytest.mark.parametrize("kind", ["flat", "uneven"])
-def test_derivatives(variant, kind):
-    for view in ("resolved", "wide"):
-        keys = ("data", "sigma_r", "footprint_sigma")
-        check_value_derivatives(load(**KINDS[kind], masking="none"), VIEWS[view], *keys)
 
 
 def test_masking_is_that_of_the_overall_roughness(variant):

@@ -12,7 +12,6 @@ import pytest
 
 from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check import suite
-from glintbsdf.check.derivatives import check_value_derivatives
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.check.truth import refined
 from glintbsdf.pndf import Filtered
@@ -131,12 +130,6 @@ def test_a_leaning_map_reflects_no_more_than_arrives(variant):
         suite.check_furnace(tilted, view)
         gained = max(gained, np.mean(suite.intensity(suite.sample(lean, view, 5000)[2])))
     assert gained > 1.1  # with respect to the geometric surface it does
-
-
-# Images have those of "lean".
-@pytest.mark.parametrize("method", ["toksvig", "variance", "clean", "leadr"])
-def test_derivatives(variant, method):
-    check_value_derivatives(load(method=method), RESOLVED, "data", "alpha", "footprint_sigma")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import skimage.io
 
 from glintbsdf import Footprint, NormalMap, maps
 from glintbsdf.check import suite
-from glintbsdf.check.derivatives import check_value_derivatives
 from glintbsdf.check.reference import normal_bounds
 from glintbsdf.check.suite import EXTREME_VIEWS, View
 from glintbsdf.footprint.kernels import KERNELS
@@ -165,17 +164,6 @@ def test_masking_is_part_of_the_value(variant):
     )
     assert dr.all((separable <= correlated) & (correlated <= value), axis=None)
     assert dr.any(separable < 0.9999 * correlated, axis=None)
-
-
-def test_derivatives(variant):
-    bsdf = load(MAPS["isotropic"], masking="beckmann", eta=0.5, k=2.0, specular_reflectance=0.5)
-    of_metal = ("specular_reflectance.value", "eta.value", "k.value")
-    check_value_derivatives(bsdf, RESOLVED, "footprint_sigma", *of_metal)
-
-
-def test_derivative_of_the_cone(variant):
-    bsdf = load(MAPS["isotropic"], pixel_spread=0.05)
-    check_value_derivatives(bsdf, View(wi=(0.3, 0.1, 1)), "pixel_spread")
 
 
 def test_albedo(variant):

@@ -16,14 +16,15 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf import maps
-from glintbsdf.check.suite import View, intensity, random_numbers
+from glintbsdf.check.suite import View, intensity, sample
 from glintbsdf.core.alignment import aligned
 
 #: Relative step of central differences.
 STEP = 0.02
 
-#: Relative error allowed, where three standard errors are less.
-ERROR = 0.02
+#: Relative error allowed in images, where three standard errors are less; and in values of a BSDF
+#: (measured: 0.0046), where places are many and the same.
+ERROR, VALUE_ERROR = 0.02, 0.01
 
 
 @dataclass(frozen=True)
@@ -80,38 +81,43 @@ def examples() -> dict[str, tuple[dict, tuple[str, ...], dict]]:
     of :func:`render_derivatives` that it takes to see their derivatives. The densities of flakes
     and of microdetails are not among them: their derivatives are right on average over patterns
     alone. Under a point light, differences of the exact P-NDF of a map jump as its triangles move.
-    Masking is left out of ``glint_mip``, whose kernel it makes twice as large.
     """
     normals = maps.isotropic(32, alpha=0.2, correlation_length=3, seed=5).normals
     data = {"data": mi.TensorXf(normals)}
-    metal = {"eta": 0.2, "k": 3.9, "specular_reflectance": 0.7}
-    of_metal = ("eta.value", "k.value", "specular_reflectance.value")
+    tint = {"specular_reflectance": 0.7}
+    metal = {"eta": 0.2, "k": 3.9, **tint}
+    reflectance = "specular_reflectance.value"
+    of_metal = ("eta.value", "k.value", reflectance)
     sizes = ("footprint_sigma", "pixel_spread")
     elements = {"type": "glint_elements", "sigma_r": 0.05, **data}
     manifold = {"type": "glint_manifold", "footprint_sigma": 2.0, **data}
-    tables = {**manifold, "footprint_sigma": 3.0, "max_error": 0.05}
+    tables = {**manifold, "footprint_sigma": 9.0, "max_error": 0.05}
     lean = {"type": "glint_filtered", "alpha": 0.1, **metal, **data}
     diffuse = {"type": "glint_diffuse", "footprint_sigma": 2.0, **data}
     mip = {
-        "type": "glint_mip", "output_size": 128, "patch_size": 16, "sigma_r": 0.05,
-        "masking": "none", **data
+        "type": "glint_mip", "output_size": 128, "patch_size": 16, "sigma_r": 0.05, **data
     }  # fmt: skip
     flakes = {"type": "glint_elements", "flake_density": 400.0, "sigma_r": 0.08}
-    grid = {"type": "glint_grid", "alpha": 0.2, "density": 6.0, "int_ior": 1.5}
-    particles = {"type": "glint_particles", "alpha": 0.2, "micro_alpha": 0.05, "density": 4.0}
+    rough = {"alpha": 0.2, **tint}
+    grid = {"type": "glint_grid", "density": 6.0, "int_ior": 1.5, **rough}
+    particles = {"type": "glint_particles", "micro_alpha": 0.05, "density": 4.0, **rough}
     lamp = {"lamp": "sphere", "spp": 64}
     table: dict[str, tuple[dict, tuple[str, ...], dict]] = {
         "elements": (elements, ("sigma_r", *sizes, "data"), {}),
         "elements, lamp": (elements, ("sigma_r", "data"), lamp),
-        "manifold": (manifold, sizes, {}),
+        "manifold": ({**manifold, **metal}, (*sizes, *of_metal), {}),
         "manifold, map": (manifold, ("data",), {**lamp, "spp": 256}),
         "tables": (tables, ("footprint_sigma",), {}),
-        "lean": (lean, ("alpha", "pixel_spread", "data", *of_metal), {}),
-        "diffuse": (diffuse, ("data", "reflectance.value"), {}),
-        "mip": (mip, ("sigma_r",), {}),
+        "lean": (lean, ("alpha", *sizes, "data", *of_metal), {}),
+        "diffuse": (diffuse, ("data", "footprint_sigma", "reflectance.value"), {}),
+        "mip": (mip, ("sigma_r", "footprint_sigma"), {}),
         "flakes": (flakes, ("sigma_r", "flake_alpha"), {}),
-        "particles": (particles, ("alpha_u", "alpha_v", "micro_alpha"), {}),
-        "grid": (grid, ("alpha_u", "alpha_v", "intensity", "eta"), {"patterns": True, "seeds": 16}),
+        "particles": (particles, ("alpha_u", "alpha_v", "micro_alpha", reflectance), {}),
+        "grid": (
+            grid,
+            ("alpha_u", "alpha_v", "intensity", "eta", reflectance),
+            {"patterns": True, "seeds": 16},
+        ),
     }
     return {
         name: ({"type": "twosided", "nested": {"pixel_spread": 0.02, **bsdf}}, keys, settings)
@@ -335,29 +341,21 @@ def check_value_derivatives(bsdf: mi.BSDF, view: View, *keys: str, count: int = 
     """Derivatives of the mean of ``count`` values of a BSDF are those of central differences.
 
     The places lie all over the map, and the directions are samples of the BSDF there. Values jump
-    where the edge of a footprint crosses a texel, so that derivatives are right on average. The
-    error allowed is a share of the derivative, and of three standard errors of its mean over
-    places. These must not be much larger than the derivative.
+    where the edge of a footprint crosses a texel, so that derivatives are right on average.
     """
-    si, u = view.interaction(count), random_numbers(count, 5, seed=7)
-    si.uv = mi.Point2f(u[3], u[4])
-    bs, _ = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
-    wo = dr.detach(bs.wo)
+    si, bs, _ = sample(bsdf, view, count, seed=7, everywhere=True)
     grown = Grown(mi.traverse(bsdf), {key: key for key in keys})
 
-    def values() -> mi.Float:
-        return dr.mean(intensity(bsdf.eval(mi.BSDFContext(), si, wo)), axis=0)
+    def mean() -> mi.Float:
+        return dr.mean(intensity(bsdf.eval(mi.BSDFContext(), si, bs.wo)), axis=None)
+
+    def value(key: str, factor: float) -> float:
+        grown.set(1, False, **{key: factor})
+        return float(mean()[0])
 
     grown.set(1, True)
-    dr.backward(dr.mean(values()))
-    gradients = grown.gradients()
-    for key in keys:
-        ends = []
-        for factor in (1 + STEP, 1 - STEP):
-            grown.set(1, False, **{key: factor})
-            ends.append(values().numpy().astype(np.float64))
-        slopes = (ends[0] - ends[1]) / (2 * STEP)
-        expected, noise = slopes.mean(), 3 * slopes.std() / np.sqrt(count)
-        told = f"{key}: {gradients[key]:.4g}, central differences {expected:.4g}, noise {noise:.2g}"
-        assert abs(gradients[key] - expected) <= ERROR * (abs(expected) + noise), told
-        assert noise <= 3 * abs(expected), f"too noisy: {told}"
+    dr.backward(mean())
+    for key, found in grown.gradients().items():
+        expected = (value(key, 1 + STEP) - value(key, 1 - STEP)) / (2 * STEP)
+        told = f"{key}: {found:.4g}, central differences {expected:.4g}"
+        assert abs(found - expected) <= VALUE_ERROR * abs(expected), told

@@ -128,10 +128,13 @@ def random_numbers(count: int, dimensions: int, seed: int) -> list[mi.Float]:
     return [mi.Float(row) for row in table]
 
 
-def sample(bsdf: mi.BSDF, view: View, count: int, seed: int = 0) -> tuple:
-    """Draw ``count`` directions: ``(si, BSDFSample3f, weight)``."""
-    u = random_numbers(count, 3, seed)
+def sample(bsdf: mi.BSDF, view: View, count: int, seed: int = 0, everywhere: bool = False) -> tuple:
+    """Draw ``count`` directions: ``(si, BSDFSample3f, weight)``; where the view is, or
+    ``everywhere`` on the map."""
+    u = random_numbers(count, 5 if everywhere else 3, seed)
     si = view.interaction(count)
+    if everywhere:
+        si.uv = mi.Point2f(u[3], u[4])
     bs, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
     dr.eval(bs, weight)
     return si, bs, weight
@@ -173,7 +176,7 @@ def density(bsdf: mi.BSDF, view: View, s: mi.Vector2f) -> mi.Float:
 
 
 def mass_in_bins(
-    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 8, repetitions: int = 8
+    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 12, repetitions: int = 8
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mass of D in each of ``res``² bins over ``bounds``, and the standard error of the quadrature.
 

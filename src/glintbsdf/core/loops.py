@@ -124,12 +124,10 @@ class Captured:
         """``thing`` with ``values`` in place of the arrays in it; itself if it holds none. ``done``
         has the objects met so far, and their replacements, by identity."""
         way = way_into(thing.__class__)
-        if way is ARRAY:
+        if way is into_array:
             place = self.places.get(identity(thing))
             return thing if place is None else values[place]
-        # Each look into a vector, or into an interaction of Mitsuba, makes new parts.
-        lasting = way is not into_vector and type(way) is not partial
-        if way is None or (lasting and id(thing) not in self.holders):
+        if way is None or (id(thing) not in self.holders and way not in MAKE_PARTS):
             return thing
         if id(thing) not in done:
             # While an object is alive, no other gets its identity.
@@ -186,7 +184,7 @@ def holds(thing: Any, is_wanted: Callable[[Any], bool], met: dict, holders: dict
     way = way_into(thing.__class__)
     if way is None:
         return False
-    if way is ARRAY:
+    if way is into_array:
         found = is_wanted(thing)
     else:
         found = any([holds(part, is_wanted, met, holders) for part in way(thing)[0]])
@@ -198,22 +196,20 @@ def holds(thing: Any, is_wanted: Callable[[Any], bool], met: dict, holders: dict
 @cache
 def way_into(kind: type) -> Callable | None:
     """How to look into objects of a type: a function that returns an object's parts, and a function
-    that makes a copy of it with other parts. :func:`ARRAY` for arrays of one dimension, None for
-    what has no parts."""
+    that makes a copy of it with other parts; None for what has no parts."""
     if dr.is_array_v(kind):
         if dr.is_tensor_v(kind):
             return None
-        return ARRAY if dr.depth_v(kind) == 1 else into_vector
+        return into_array if dr.depth_v(kind) == 1 else into_vector
     if issubclass(kind, tuple | list):
         return into_list
-    fields = getattr(kind, "DRJIT_STRUCT", None)  # Mitsuba's interactions, for example, have it
-    if fields and not issubclass(kind, type):
-        return partial(into_attributes, fields=tuple(fields))
+    if getattr(kind, "DRJIT_STRUCT", None) and not issubclass(kind, type):
+        return into_struct  # Mitsuba's interactions, for example
     return WAYS.get(kind) or (into_object if keeps_attributes(kind) else None)
 
 
-def ARRAY(array: Any) -> tuple[list, Callable]:  # noqa: N802
-    """Stands for arrays of one dimension, which have no parts."""
+def into_array(array: Any) -> tuple[list, Callable]:
+    """Arrays of one dimension have no parts; they are what is searched."""
     return [], lambda new: array
 
 
@@ -238,9 +234,12 @@ def into_partial(thing: partial) -> tuple[list, Callable]:
     return [thing.func, thing.args, thing.keywords], lambda new: partial(new[0], *new[1], **new[2])
 
 
-def into_attributes(thing: Any, fields: tuple[str, ...]) -> tuple[list, Callable]:
-    parts, kind = [getattr(thing, name) for name in fields], type(thing)
-    return parts, lambda new: with_attributes(kind(thing), zip(fields, new, strict=True))
+def into_struct(thing: Any) -> tuple[list, Callable]:
+    kind = type(thing)
+    names = list(kind.DRJIT_STRUCT)
+    return [getattr(thing, name) for name in names], lambda new: with_attributes(
+        kind(thing), zip(names, new, strict=True)
+    )
 
 
 def into_object(thing: Any) -> tuple[list, Callable]:
@@ -306,6 +305,9 @@ def with_attributes(thing, attributes):
         object.__setattr__(thing, name, value)
     return thing
 
+
+#: The ways that make an object's parts anew with each look.
+MAKE_PARTS = into_vector, into_struct
 
 #: How to look into objects of these types; see :func:`way_into`.
 WAYS: dict[type, Callable] = {

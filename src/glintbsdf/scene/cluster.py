@@ -89,11 +89,11 @@ _loaded: OrderedDict[Job, tuple[Renderer, ExitStack]] = OrderedDict()
 
 
 @atexit.register
-def _forget() -> None:
-    """Free all loaded scenes; at exit, before Mitsuba is gone."""
-    while _loaded:
-        _, (_, stack) = _loaded.popitem()
-        stack.close()
+def _forget(kept: int = 0) -> None:
+    """Free the loaded scenes except for the last ``kept``; at exit all, before Mitsuba is gone."""
+    while len(_loaded) > kept:
+        _loaded.popitem(last=False)[1][1].close()
+    gc.collect()  # scenes and their plugins refer to each other
 
 
 @dataclass(frozen=True)
@@ -191,11 +191,7 @@ def _renderer(job: Job, store: Store, threads: int) -> Renderer:
         raise ClusterError(f"a worker's Mitsuba has no variant {job.variant}")
     if mi.variant() != job.variant:
         _forget()
-    while len(_loaded) >= SCENES:
-        _, (_, stack) = _loaded.popitem(last=False)
-        stack.close()
-        del stack
-        gc.collect()
+    _forget(SCENES - 1)
     if job.variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise ClusterError(f"{job.variant} needs an NVIDIA GPU, and a worker has none")
     if mi.variant() != job.variant:

@@ -11,7 +11,6 @@ import pytest
 
 from glintbsdf import maps
 from glintbsdf.check import suite
-from glintbsdf.check.derivatives import check_value_derivatives
 from glintbsdf.check.suite import View
 from glintbsdf.core.errors import ParameterError
 from glintbsdf.footprint.gaussian import Footprint
@@ -377,13 +376,6 @@ def test_shared_suite(variant, normal_map, max_error):
     suite.check_furnace(bsdf, replace(VIEW, wi=(0, 0, 1)))
     for extreme in suite.EXTREME_VIEWS.values():
         suite.check_finite(bsdf, extreme)
-
-
-def test_derivative_of_the_value(variant, normal_map):
-    """Away from footprints at which the level changes: D jumps there."""
-    bsdf = load(normal_map, max_error=0.05)
-    assert bsdf.pndf.level(bsdf.footprint(VIEW.interaction())).numpy().item() >= 0
-    check_value_derivatives(bsdf, VIEW, "footprint_sigma")
 
 
 def test_other_variants(each_variant, normal_map):

@@ -83,7 +83,7 @@ LISTS_SPREAD = 3.0
 #: The lists for lights allow flat elements this share of the variance by which the mean element
 #: exceeds the median one. On maps that are flat between edges, merged elements blur by the mean
 #: variance, so the lists serve up to lights about as wide as this.
-FLAT_SHARE = 0.4
+FLAT_SHARE = 0.5
 
 #: Memory allowed to the lists, in bytes per cell: with one seed per cell, and with several. The
 #: whole structure then takes less memory than the paper reports.
@@ -215,7 +215,7 @@ class Mixture(PNDF):
     #: Merged elements, for queries with a light's spread; None until :meth:`prepare_for_lights`.
     levels: Levels | None = None
 
-    #: Least roughness that the lists are built for.
+    #: Roughness that the lists are built for where ``sigma_r`` is smaller.
     listed = 0.0
 
     #: Corner of the first cell, in cells; (−½, −½) is the corner of the map.
@@ -565,7 +565,7 @@ class Elements(Mixture):
         listed: float = 0.0,
     ) -> None:
         check_sigma_r(owner, sigma_r)
-        self.listed = listed
+        self.listed = self.least_listed = listed
         check(0 < step < inf, owner, "step", "a finite number > 0", step)
         self.check_room(normal_map, owner, domain)
         self.normal_map, self.step, self.curved, self.owner = normal_map, step, curved, owner
@@ -673,9 +673,9 @@ class Elements(Mixture):
         mean, median = (
             self.curved_variance(slope) for slope in (self.levels.slope, self.levels.median_slope)
         )
-        flat = sqrt(self.sigma_r[0] ** 2 + FLAT_SHARE * max(mean - median, 0))
-        # In steps, so that small changes of the map keep it.
-        listed = max(self.listed, 2 ** (round(2 * log2(flat)) / 2))
+        flat = FLAT_SHARE * max(mean - median, MIN_SIGMA_R**2)
+        # In steps of √2, so that small changes of the map keep it.
+        listed = max(self.least_listed, 2 ** (round(log2(flat)) / 2))
         if (self.normal_reach, self.listed) != (LIGHT_REACH, listed):
             self.normal_reach, self.listed = LIGHT_REACH, listed
             if self.lists is not None:

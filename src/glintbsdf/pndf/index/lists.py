@@ -193,8 +193,8 @@ class NormalCells:
 
     @staticmethod
     def histogram(normals, lower, upper) -> np.ndarray:
-        """Number of ``normals`` (``mi.Float``, x and y by turns) in each pixel of the tables: an
-        array over x and y, whose row i is the sum of the rows of pixels before i."""
+        """Numbers of ``normals`` (``mi.Float``, x and y by turns) in the pixels of the tables, an
+        array over x and y, cumulative along x: row i counts the pixels of all rows before i."""
         count = dr.arange(mi.UInt32, dr.width(normals) // 2)
         scale = (RESOLUTION / (upper - lower)).astype(np.float32)
         pixel = []
