@@ -146,3 +146,20 @@ def test_spread_of_the_half_vector(variant):
     h = dr.normalize(wi + dr.normalize(wo + s * mi.Float(x) + t * mi.Float(y)))
     expected = np.cov(np.array(h)[:2])
     assert np.abs(found - expected).max() < 0.02 * expected.max()
+
+
+def test_shift_of_a_wide_light(variant):
+    """The shift leads to the mean of the half vectors of a light of 0.2 radians."""
+    wi = dr.normalize(mi.Vector3f(0.3, -0.2, 1))
+    wo = dr.normalize(mi.Vector3f(-0.9, 0.6, 0.5))
+    zero, radius = mi.Vector3f(0), 0.2
+    shift = np.array(Carried(zero, zero, mi.Float(0.25 * radius**2)).shift(wi, wo)).ravel()
+    centre = np.array(dr.normalize(wi + wo)).ravel()[:2]
+    s, t = mi.coordinate_system(wo)
+    random = np.random.default_rng(4).random((2, 400_000), dtype=np.float32)
+    disk = radius * mi.warp.square_to_uniform_disk_concentric(mi.Point2f(random))
+    h = np.array(dr.normalize(wi + dr.normalize(wo + s * disk.x + t * disk.y)))[:2]
+    expected, noise = h.mean(1) - centre, h.std(1).max() / len(h[0]) ** 0.5
+    assert np.linalg.norm(expected) > 20 * noise
+    assert np.abs(shift - expected).max() < 4 * noise + 0.03 * np.linalg.norm(expected)
+    assert np.all(np.array(Carried(zero, zero, mi.Float(0)).shift(wi, wo)) == 0)

@@ -263,7 +263,7 @@ class FootprintBSDF(mi.BSDF):
         to_uv = mi.AffineTransform3f(self.to_uv).matrix
         inverse = dr.rcp(mi.Matrix2f([[to_uv[0, 0], to_uv[0, 1]], [to_uv[1, 0], to_uv[1, 1]]]))
         turn, spread = carried.turn(si) @ inverse, carried.spread(wi, wo)
-        return Query(footprint, turn, spread, parameters, place)
+        return Query(footprint, turn, spread, parameters, place, carried.shift(wi, wo))
 
     def parameters_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Mapping[str, mi.Float]:
         """The values of :attr:`textures` at ``si``, by name, clipped to the parameter's range."""
@@ -537,7 +537,7 @@ class GlintBSDF(FootprintBSDF):
         m = component.half_vector(wi, wo)
         query = self.query(si, active, wi, wo)
         facets = self.facets(ctx, si, active)
-        density = self.density(facets.pndf, m, query, si, active)
+        density = self.density(facets.pndf, query.centre(m), query, si, active)
         value = component.value(density, wi.z)
         pdf = facets.pndf.visible_pdf(wi, m, density, query, active)
         return (

@@ -103,6 +103,22 @@ class Carried:
             for v in (axis - m * dr.dot(m, axis) for axis in mi.coordinate_system(wo))
         )
 
+    def shift(self, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Vector2f:
+        """What the mean of the light's projected half vectors differs by from that of its centre.
+
+        The half vector is not linear in ω_o. Under a light of 0.2 radians this shift changes
+        densities by some hundredths. The mean is that of four points of the light, which have its
+        covariance.
+        """
+        step = dr.sqrt(2 * self.variance)
+        mean = mi.Vector2f(0)
+        for axis in mi.coordinate_system(wo):
+            for offset in (step * axis, -step * axis):
+                m = dr.normalize(wi + dr.normalize(wo + offset))
+                mean = mean + 0.25 * mi.Vector2f(m.x, m.y)
+        centre = dr.normalize(wi + wo)
+        return dr.select(self.variance > 0, mean - mi.Vector2f(centre.x, centre.y), 0)
+
 
 def half_vector_turn(
     si: mi.SurfaceInteraction3f,

@@ -21,6 +21,7 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.footprint.gaussian import Footprint, tangent_to_uv
@@ -63,6 +64,8 @@ class Query:
         parameters: values, by name, of the P-NDF's parameters that have a
             texture, at the surface point.
         place (Place): position of the footprint in space; None if no method needs it.
+        shift (mi.Vector2f): what the centre of the spread differs by from the projected normal that
+            is asked for; None for no difference.
     """
 
     def __init__(
@@ -72,9 +75,10 @@ class Query:
         spread: tuple[mi.Vector2f, ...] = (),
         parameters: Mapping[str, mi.Float] | None = None,
         place: Place | None = None,
+        shift: mi.Vector2f | None = None,
     ) -> None:
         self.footprint, self.turn, self.spread = footprint, turn, tuple(spread)
-        self.parameters, self.place = dict(parameters or {}), place
+        self.parameters, self.place, self.shift = dict(parameters or {}), place, shift
         self._derived: dict[Hashable, object] = {}
 
     def __repr__(self) -> str:
@@ -89,7 +93,14 @@ class Query:
 
     def at(self, footprint: Footprint) -> Query:
         """The same query with another footprint."""
-        return Query(footprint, self.turn, self.spread, self.parameters, self.place)
+        return Query(footprint, self.turn, self.spread, self.parameters, self.place, self.shift)
+
+    def centre(self, m: mi.Vector3f) -> mi.Vector3f:
+        """The unit normal about which the spread averages, where ``m`` is asked for."""
+        if self.shift is None:
+            return m
+        s = mi.Vector2f(m.x, m.y) + self.shift
+        return mi.Vector3f(s.x, s.y, dr.copysign(dr.safe_sqrt(1 - dr.squared_norm(s)), m.z))
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """The result of ``make()``, which is called on first use only.

@@ -163,7 +163,8 @@ def curved_interaction(pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.Su
     duv1, duv2 = (tangent_to_uv(si.dp_du, si.dp_dv, edge) for edge in (p1 - p0, p2 - p0))
     inv_det = dr.rcp(duv1.x * duv2.y - duv1.y * duv2.x)
     inv_det = dr.select(known & dr.isfinite(inv_det), inv_det, 0)
-    dn_db1, dn_db2 = si.dn_du, si.dn_dv
+    # Copies, as an attribute of an interaction is a view that changes with it
+    dn_db1, dn_db2 = mi.Vector3f(si.dn_du), mi.Vector3f(si.dn_dv)
     si.dn_du = dr.select(is_mesh, (dn_db1 * duv2.y - dn_db2 * duv1.y) * inv_det, dn_db1)
     si.dn_dv = dr.select(is_mesh, (dn_db2 * duv1.x - dn_db1 * duv2.x) * inv_det, dn_db2)
     return si

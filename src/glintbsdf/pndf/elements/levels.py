@@ -64,7 +64,7 @@ def widening(cut: mi.Float) -> mi.Float:
 
 #: The level of a query is the coarsest at which a footprint's minor standard deviation spans about
 #: this many cells,
-CELLS_PER_SIGMA = 2.0
+CELLS_PER_SIGMA = 2.5
 
 #: and the normals change by about this multiple of the light's spread from cell to cell,
 NORMALS_PER_SPREAD = 2.0
@@ -77,6 +77,10 @@ MERGE_REACH = 4.0
 
 #: D counts as 0 beyond this many standard deviations from the bounds of the map's normals.
 MARGIN = 4.5
+
+#: An element counts as 0 beyond this squared Mahalanobis distance, in the covariance of element and
+#: light together. exp(−16/2) = 3e-4 of a Gaussian lies beyond, and nothing of a wide light.
+LIGHT_CUT = 16.0
 
 #: Variance added to the residual covariance of merged elements, well above its rounding errors.
 ROUNDING = 1e-7
@@ -270,9 +274,18 @@ class Levels:
             form = form_of_adjoint(xx, xy, yy, delta)
             if query.spread:
                 mixed = xx * light.yy + yy * light.xx - 2 * xy * light.xy
-                seen = averaged_over_ellipse(
-                    (determinant, mixed, light.determinant),
-                    (form, form_of_adjoint(light.xx, light.xy, light.yy, delta)),
+                of_light = form_of_adjoint(light.xx, light.xy, light.yy, delta)
+                near = form + of_light < LIGHT_CUT * (determinant + mixed + light.determinant)
+                # The rays of a pixel agree on what is near, so far elements are skipped
+                seen = dr.if_stmt(
+                    (determinant, mixed, form, of_light),
+                    inside & near,
+                    lambda determinant, mixed, form, of_light: averaged_over_ellipse(
+                        (determinant, mixed, light.determinant), (form, of_light)
+                    ),
+                    lambda *_: mi.Float(0),
+                    mode="symbolic",
+                    label="element in light",
                 )
             else:
                 inverse_root = dr.rsqrt(determinant)
