@@ -31,16 +31,22 @@ PIXEL_SIGMA = 0.5
 #: Variance (pixels²) below which a filter has nothing to share.
 LEAST_VARIANCE = 1e-3
 
+#: Samples per pixel up to which footprints carry the whole filter, and the same for a filter that
+#: drops to zero at its ends.
+WHOLE_SAMPLES, WHOLE_SAMPLES_ABRUPT = 12, 4
+
 
 def automatic_share(samples: int, abrupt: bool) -> float:
     """The share a of footprints where an image takes ``samples`` samples per pixel, in (0, 1].
 
-    Footprints are an approximation, and what they leave out of a pixel counts less the smaller they
-    are: a falls with the number of samples, so slowly that the samples' noise falls as before.
-    Footprints reach beyond the ends of an ``abrupt`` filter, see :class:`PixelFilter`. There the
-    share falls as fast as the noise.
+    A footprint approximates its pixel. The squared error of this is about proportional to a², that
+    of samples to (1 − a)/N. So up to :data:`WHOLE_SAMPLES` samples footprints carry the whole
+    filter, and then their share falls as N^(−1/3). Footprints reach beyond the ends of an
+    ``abrupt`` filter, see :class:`PixelFilter`. There the share falls sooner, as fast as the noise.
     """
-    return min(1.0, 4 / samples) if abrupt else float(samples) ** -0.125
+    if abrupt:
+        return min(1.0, WHOLE_SAMPLES_ABRUPT / samples)
+    return min(1.0, WHOLE_SAMPLES / samples) ** (1 / 3)
 
 
 class PixelFilter:
