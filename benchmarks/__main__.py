@@ -15,6 +15,7 @@ import click
 #: Modules of ``benchmarks.commands``; each has a command of its own name.
 COMMANDS = (
     "error_vs_time",
+    "convergence",
     "stability",
     "accuracy",
     "cost",

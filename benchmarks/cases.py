@@ -189,6 +189,7 @@ def curved_patch(
     spp: int = 16,
     light_radius: float = LIGHT_RADIUS,
     field_of_view: float = 45,
+    integrator: str = "path",
 ) -> mi.Scene:
     """``scenes/curved_patch.xml`` with ``material``, the dictionary of a BSDF, on both sides.
 
@@ -209,7 +210,8 @@ def curved_patch(
         text = text.replace(f'name="{name}" value="{own}"', f'name="{name}" value="{new}"')
     if str(SCENES) not in [str(path) for path in mi.file_resolver()]:
         mi.file_resolver().append(str(SCENES))
-    scene = mi.load_string(text, spp=str(spp), resx=str(size), resy=str(size))
+    given = {"spp": spp, "resx": size, "resy": size, "integrator": integrator}
+    scene = mi.load_string(text, **{name: str(value) for name, value in given.items()})
     # A scene in XML cannot take a dictionary: the material replaces the one of the loaded shape.
     patch = next(shape for shape in scene.shapes() if not shape.is_emitter())
     patch.set_bsdf(mi.load_dict({"type": "twosided", "nested": material}))

@@ -4,8 +4,8 @@
 texels. The relative L1, L2 and maximum error, against the binned reference and its noise, over time
 per query (random places, normals drawn from the P-NDF, one thread) and over memory. Elements, lobes
 and filters have an intrinsic roughness, and their reference has the same. *Images*: the curved
-patch against brute force, for log-spaced numbers of samples and several seeds. Footprints shrink
-with the number of samples, as in ``glintbsdf render``. All methods run in turn within every
+patch against brute force, for log-spaced numbers of samples and several seeds, by ``glint_path``,
+as in ``glintbsdf render``. All methods run in turn within every
 repetition; building and compiling are timed separately.
 
 The folder gets ``report.html``, one page with everything; the same as JSON and CSV;

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import glintbsdf  # noqa: F401  (first in a renderer's process: it names Dr.Jit's LLVM library)
 
-import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np
 import scipy.stats
@@ -19,16 +18,12 @@ from benchmarks.cases import Surface, curved_patch, scaled
 from benchmarks.harness import ratios_to_first, seconds, seconds_in_turn, timed
 from benchmarks.methods import BASELINES, Method
 from glintbsdf.check.truth import Truth, reference_render
-from glintbsdf.scene.rendering import pixel_spread
 
 #: Radius of the lights; brute force finds the scene's smaller ones too rarely.
 LIGHT_RADIUS = 0.07
 
 #: Field of view, degrees: the patch fills the image, and lights are visible in it only.
 FIELD_OF_VIEW = 30.0
-
-#: Standard deviation of a box of one pixel, so that footprints have the variance of pixels.
-FOOTPRINT_SIGMA = 12**-0.5
 
 #: Seconds that a process gets to end by itself.
 PATIENCE = 20
@@ -78,7 +73,7 @@ class Renderer:
             raise RuntimeError("a process that renders has failed, see above") from None
 
     def render(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
-        """An image with footprints for ``spp`` samples per pixel, and its seconds."""
+        """An image of ``spp`` samples per pixel, and its seconds."""
         self.connection.send((spp, seed))
         return self.receive()
 
@@ -108,13 +103,14 @@ def serve(connection, variant: str, *arguments: object) -> None:
 
 
 def load(material: Method | str, surface: Surface, scale: float, settings: Settings) -> mi.Scene:
-    """Load the scene with a material, which is a method or the name of a baseline."""
+    """Load the scene with a material, which is a method or the name of a baseline. Methods have the
+    integrator ``glint_path``, as in ``glintbsdf render``, and baselines have ``path``."""
     shared = {"material": "Cr", "to_uv": scaled(scale)}
     if isinstance(material, str):
-        described = BASELINES[material](surface.normal_map, **shared)
+        described, integrator = BASELINES[material](surface.normal_map, **shared), "path"
     else:
-        described = material.describe(surface) | shared | {"footprint_sigma": FOOTPRINT_SIGMA}
-    return curved_patch(described, settings.size, 1, LIGHT_RADIUS, FIELD_OF_VIEW)
+        described, integrator = material.describe(surface) | shared, "glint_path"
+    return curved_patch(described, settings.size, 1, LIGHT_RADIUS, FIELD_OF_VIEW, integrator)
 
 
 @contextmanager
@@ -142,13 +138,7 @@ def truth(surface: Surface, scale: float, settings: Settings):
 
 
 def render(scene: mi.Scene, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """An image with footprints of ``spp`` samples per pixel, and the seconds of rendering alone."""
-    parameters = mi.traverse(scene)
-    for key in (key for key in parameters.keys() if key.endswith("pixel_spread")):
-        # Opaque, so that one kernel serves all numbers of samples.
-        parameters[key] = dr.opaque(mi.Float, pixel_spread(scene.sensors()[0], spp))
-    parameters.update()
-
+    """An image, and the seconds of rendering alone."""
     image, taken = timed(lambda: mi.render(scene, spp=spp, seed=seed))
     return np.array(image)[..., :3].astype(np.float64), taken
 

@@ -179,3 +179,28 @@ def images(name: str, points: list[dict], noise: float, names: list[str]) -> Fig
     axes[0].set_ylabel("relative RMSE")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper")
     return figure
+
+
+def convergence(name: str, rows: list[dict]) -> Figure:
+    """Error over time by light, with the line of sampling alone and the noise of the truth."""
+    cases = list(dict.fromkeys((row["light"], row["texels"]) for row in rows))
+    figure, axes = panels(len(cases), most=3)
+    for axis, (light, texels) in zip(axes, cases, strict=True):
+        own = [row for row in rows if (row["light"], row["texels"]) == (light, texels)]
+        for index, method in enumerate(dict.fromkeys(row["method"] for row in own)):
+            look = {"color": COLOURS[index % len(COLOURS)], "linewidth": 1}
+            points = [row for row in own if row["method"] == method]
+            glints = [row for row in points if row["by"] == "glint_path"]
+            at, error = column(glints, "seconds"), column(glints, "error")
+            axis.plot(at, error, MARKERS[index % len(MARKERS)] + "-", label=method, **look)
+            alone = next(row for row in points if row["by"] == "sampling alone")
+            chance = alone["error"] * np.sqrt(alone["seconds"] / at)
+            axis.plot(at, chance, ":", label=f"{method}, sampling alone", **look)
+        axis.axhline(own[0]["noise_of_truth"], linestyle="--", color="#777777", linewidth=0.9)
+        axis.set(xscale="log", yscale="log", title=f"{light}, {texels:g} texels a pixel")
+        label_logarithmic(axis.xaxis, axis.yaxis)
+        axis.set_xlabel("seconds of rendering")
+    axes[0].set_ylabel("error over contrast")
+    lines, labels = axes[0].get_legend_handles_labels()
+    legend_below(figure, dict(zip(labels, lines, strict=True)), len(axes))
+    return figure
