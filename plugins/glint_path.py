@@ -88,7 +88,9 @@ the image does.
 
 **Small lights are sampled at every hit**, as the noise of a random choice would be large on glints.
 One of the remaining emitters, environments among them, is chosen in proportion to its
-``sampling_weight``.
+``sampling_weight``. If only the environment remains, BSDFs that integrate lights look for it by
+BSDF sampling alone, unless they have a diffuse lobe: a direction of the environment mostly meets no
+glint, and the P-NDF there costs as much as that of a good direction.
 
 **The P-NDF integrates small lights** in BSDFs that are able to do so, which are
 :ref:`glint_elements <bsdf-glint_elements>`, :ref:`glint_manifold <bsdf-glint_manifold>`,
@@ -368,7 +370,8 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
         si_prev = dr.zeros(mi.Interaction3f)
         bsdf_pdf_prev = mi.Float(1)
         bsdf_delta_prev = mi.Bool(True)
-        integrated_prev = mi.Bool(False)  # Whether that BSDF integrates small lights
+        integrated_prev = mi.Bool(False)  # Whether that BSDF integrates small lights,
+        alone_prev = mi.Bool(False)  # and whether it alone looks for the environment
 
         # An environment is always visible, everything else once a path has hit it
         valid = mi.Bool(not self.hide_emitters and scene.environment() is not None)
@@ -394,8 +397,9 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             # ---------------------- Direct emission ----------------------
 
             emitted = emission(
-                lights, scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev, integrated_prev
-            )
+                lights, scene, si, si_prev, bsdf_pdf_prev, bsdf_delta_prev, integrated_prev,
+                alone_prev,
+            )  # fmt: skip
             if dr.hint(self.separate, mode="scalar"):
                 L_direct[seen] = spectrum_fma(β, emitted, L_direct)
                 L[~seen] = spectrum_fma(β, emitted, L)
@@ -462,7 +466,10 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
                 ray_glint, weight = scatter(bsdf, glint_ctx, si, bs_glint, weight, glints)
                 si_glint = scene.ray_intersect(ray_glint, glints)
                 pdf = dr.select(glints, bs_glint.pdf, 0)
-                emitted = emission(lights, scene, si_glint, si, pdf, mi.Bool(False), hit.integrates)
+                emitted = emission(
+                    lights, scene, si_glint, si, pdf, mi.Bool(False),
+                    hit.integrates, hit.finds_environment,
+                )  # fmt: skip
                 L_direct[glints] = spectrum_fma(β, weight * emitted, L_direct)
 
                 # A smooth lobe continues the path: emitters that it meets next are not counted
@@ -490,6 +497,7 @@ class GlintPathIntegrator(mi.SamplingIntegrator):
             si_prev = mi.Interaction3f(si)
             bsdf_delta_prev = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             integrated_prev = hit.integrates & ~bsdf_delta_prev
+            alone_prev = hit.finds_environment & ~bsdf_delta_prev
 
             # -------------------- Stopping criterion ---------------------
 
@@ -566,6 +574,15 @@ class Hit:
         self.integrates = (self.bsdf.flags() & INTEGRATES_LIGHTS) != 0
         self.turned = cone.turned_per_uv(curved)
 
+    @property
+    def finds_environment(self) -> mi.Bool:
+        """Whether BSDF sampling alone looks for the environment. Its bright regions are lights, and
+        in the rest an emitter sample costs as much as one of the BSDF and tells less, unless the
+        BSDF has a diffuse lobe."""
+        if not self.lights.others_are_environments:
+            return mi.Bool(False)
+        return self.integrates & ~mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Diffuse)
+
     def finds_all_lights(self) -> mi.Bool:
         """Whether emitter sampling finds all lights, so that BSDF sampling need not."""
         mirrors = mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Delta)
@@ -615,6 +632,7 @@ def direct_light(
         active = active | wanted
 
     L = light_of_sampled(hit, sampler, lobes, active)
+    active = active & ~hit.finds_environment
     if lights.sampled_count == 0:
         ds, weight = hit.scene.sample_emitter_direction(hit.si, sampler.next_2d(), False, active)
     elif lights.others_count > 0:
@@ -709,19 +727,22 @@ def emission(
     pdf_prev: mi.Float,
     delta_prev: mi.Bool,
     integrated_prev: mi.Bool,
+    alone_prev: mi.Bool,
 ) -> mi.Spectrum:
     """Emission to ``si_prev`` of the emitter at ``si``, if there is one.
 
     A BSDF sample of density ``pdf_prev`` has found it. It is weighted for multiple importance
-    sampling with emitters, and 0 where the density is 0, or where the BSDF has already integrated
-    this emitter.
+    sampling with emitters, except for the environment where the BSDF alone looks for it,
+    ``alone_prev``. It is 0 where the density is 0, or where the BSDF has already integrated this
+    emitter.
     """
     ds = mi.DirectionSample3f(scene, si, si_prev)
     if lights.extents:
         counted = integrated_prev & lights.view(ds.emitter, si_prev.p).small
         counted |= lights.in_region(ds, integrated_prev & (pdf_prev > 0))
         pdf_prev = dr.select(counted, 0, pdf_prev)
-    em_pdf = lights.pdf_direction(scene, si_prev, ds, ~delta_prev)
+    alone = alone_prev & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    em_pdf = dr.select(alone, 0, lights.pdf_direction(scene, si_prev, ds, ~delta_prev & ~alone))
     return ds.emitter.eval(si, pdf_prev > 0) * mis_weight(pdf_prev, em_pdf)
 
 

@@ -182,7 +182,7 @@ def images(name: str, points: list[dict], noise: float, names: list[str]) -> Fig
 
 
 def convergence(name: str, rows: list[dict]) -> Figure:
-    """Error over time by light, with the line of sampling alone and the noise of the truth."""
+    """Error over time by light. Dotted is sampling alone, dashed the noise of the truth."""
     cases = list(dict.fromkeys((row["light"], row["texels"]) for row in rows))
     figure, axes = panels(len(cases), most=3)
     for axis, (light, texels) in zip(axes, cases, strict=True):
@@ -195,12 +195,11 @@ def convergence(name: str, rows: list[dict]) -> Figure:
             axis.plot(at, error, MARKERS[index % len(MARKERS)] + "-", label=method, **look)
             alone = next(row for row in points if row["by"] == "sampling alone")
             chance = alone["error"] * np.sqrt(alone["seconds"] / at)
-            axis.plot(at, chance, ":", label=f"{method}, sampling alone", **look)
+            axis.plot(at, chance, ":", **look)
         axis.axhline(own[0]["noise_of_truth"], linestyle="--", color="#777777", linewidth=0.9)
         axis.set(xscale="log", yscale="log", title=f"{light}, {texels:g} texels a pixel")
         label_logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel("seconds of rendering")
     axes[0].set_ylabel("error over contrast")
-    lines, labels = axes[0].get_legend_handles_labels()
-    legend_below(figure, dict(zip(labels, lines, strict=True)), len(axes))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

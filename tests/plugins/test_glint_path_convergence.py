@@ -299,12 +299,20 @@ def mixed_lights():
     }
 
 
+def window():
+    """An environment with a window, too dim to be cut out as a light."""
+    sky = np.full((16, 32, 3), 0.5, np.float32)
+    sky[4:8, 8:16] = 5.0
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky)}
+
+
 def lit_by(name):
     """Lights, and an obstacle in front of them."""
     return {
         "one": {"light": ball_light()},
         "many": many_lights(2 * MAX_SAMPLED),
         "mixed": mixed_lights(),
+        "window": {"light": ball_light(), "sky": window()},
         "occluded": {
             "light": ball_light((0, 0, 8), 1.0),
             "screen": {
@@ -327,7 +335,8 @@ def lit_by(name):
 
 @pytest.mark.parametrize(
     ("name", "emitters"),
-    [(name, "all") for name in ("one", "many", "mixed", "occluded", "mirror")] + [("mixed", "one")],
+    [(name, "all") for name in ("one", "many", "mixed", "window", "occluded", "mirror")]
+    + [("mixed", "one")],
 )
 def test_mean_is_that_of_path(variant, name, emitters):
     """For every kind of light, in shadow and in mirrors, the energy of the image is the same,
@@ -442,3 +451,28 @@ def test_lights_without_a_view(variant):
         assert np.all(np.isfinite(np.array(view.d)))
         d = mi.Vector3f(0, 0, 1)
         assert np.all(np.array(view.contracted(d, view.spread(1.0))) == np.array(d))
+
+
+def test_a_diffuse_lobe_keeps_samples_of_the_environment(variant):
+    """Glints alone find the environment by BSDF sampling. With a diffuse lobe beside them, the
+    variance under a window is that of ``path``, or three times that: a Gaussian filter that spreads
+    samples over pixels averages as many of them."""
+
+    def variance(bsdf, integrator):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": sensor(),
+                "board": {"type": "rectangle", "to_world": transform().scale(3), "bsdf": bsdf},
+                "sky": window(),
+            }
+        )
+        found = images(scene, integrator, 16, 12, max_depth=2, hide_emitters=True)
+        return found.mean(), found.var(0, ddof=1).mean()
+
+    data = mi.TensorXf(procedural.isotropic(16, seed=3).normals)
+    glints = {"type": "glint_elements", "data": data, "masking": "none", "sigma_r": 0.05}
+    paint = {"type": "blendbsdf", "weight": 0.1, "paint": {"type": "diffuse"}, "glints": glints}
+    assert variance(paint, "glint_path")[1] < 4 * variance(paint, "path")[1]
+    alone, both = variance(glints, "glint_path"), variance(glints, "path")
+    assert abs(alone[0] / both[0] - 1) < 0.02

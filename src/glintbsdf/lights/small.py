@@ -112,6 +112,8 @@ class SmallLights:
                 elliptic[names[k]] = emitters[k].get_shape().class_name() in ELLIPTIC
         self.probability = mi.Float(probability)
         self.extended, self.elliptic = mi.Bool(small), mi.Bool(elliptic)
+        #: Whether every emitter that is not sampled at every hit is an environment.
+        self.others_are_environments = every and all(emitters[k].is_environment() for k in others)
         #: Whether all emitters are sampled at every hit, and all are points or may be small. BSDF
         #: sampling is then needed for none of them.
         self.complete = (
