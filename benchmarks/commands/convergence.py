@@ -155,7 +155,7 @@ def lit(run: Run) -> None:
     write_csv(run.output / "convergence.csv", [
         {key: row[key] for key in ("light", "texels", "method")}
         | {"error": f"{row['error']:.1%}", "bias": f"{row['bias']:.1%}",
-           "factor": f"{row['factor']:.2g}"}
+           "factor": f"{row['factor']:{'.0f' if row['factor'] >= 10 else '.2g'}}"}
         for row in table.rows if (row["by"], row["spp"]) == ("glint_path", 16)
     ])  # fmt: skip
 
