@@ -31,7 +31,7 @@ Glitter without a map, from a handful of flakes to more than anyone could count,
    - |float|
    - Beckmann roughness of a single facet. Greater than 0: a perfect mirror would show nothing of a
      small light but by chance. At most half of the least :monosp:`alpha`, as all facets together
-     are rougher than each. (Default: 0.01)
+     are rougher than each. (Default: 0.01, or this limit where it is less)
    - |exposed|, |differentiable|
 
  * - colors
@@ -167,6 +167,7 @@ from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.query import Place
 from glintbsdf.pndf import Particles
 from glintbsdf.pndf.colors import Palette, Wheel, varied
+from glintbsdf.pndf.particles.particles import ROUGHEST
 
 VARIATIONS = ("hue_variation", "saturation_variation", "value_variation")
 
@@ -186,10 +187,11 @@ class GlintParticles(GlintBSDF):
             requirement = 'left out where "space" is object'
             check("to_uv" not in props, self.owner, "to_uv", requirement, "a transform")
             self.to_object = parameters.transform("to_object")
+        alpha = parameters.per_axis("alpha", 0.3)
         self.options = {
-            "alpha": parameters.per_axis("alpha", 0.3),
+            "alpha": alpha,
             "density": parameters.number("density", 8.0),
-            "micro_alpha": parameters.number("micro_alpha", 0.01),
+            "micro_alpha": parameters.number("micro_alpha", min(0.01, ROUGHEST * min(alpha))),
             "distribution": distribution,
             "colors": self.colors(parameters),
             "seed": parameters.whole("seed", 0),

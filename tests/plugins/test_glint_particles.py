@@ -308,6 +308,7 @@ NO_MAP = ("wrap_mode", "map_type", "height_scale", "filename", "data", "bitmap")
 BAD_SHARED_PARAMETERS = [
     case for case in suite.BAD_PARAMETERS if case[1] not in NO_MAP and "data" not in case[0]
 ]
+
 NEGATIVE, NOT_FINITE = (np.array([[[0.5, value, 0.5]]], np.float32) for value in (-0.1, suite.NAN))
 BAD_OWN_PARAMETERS = [
     ({"distribution": "phong"}, "distribution"),
@@ -319,7 +320,7 @@ BAD_OWN_PARAMETERS = [
     ({"micro_alpha": 0.0}, "micro_alpha"),
     ({"micro_alpha": 0.16}, "micro_alpha"),
     ({"micro_alpha": 0.2, "distribution": "beckmann"}, "micro_alpha"),
-    ({"alpha_v": 0.01}, "micro_alpha"),
+    ({"alpha_v": 0.01, "micro_alpha": 0.01}, "micro_alpha"),
     ({"density": suite.NAN}, "density"),
     ({"density": 16.5}, "density"),
     ({"density": 1e30}, "density"),
@@ -414,3 +415,10 @@ def test_adapters(variant):
     plain = render(glints)
     assert plain.std() > 0.05
     assert np.allclose(render({"type": "twosided", "nested": glints}), plain, rtol=1e-3, atol=1e-3)
+
+
+def test_default_facets_of_a_polished_surface(variant):
+    """Facets are as rough as the surface allows where that is less than their usual roughness."""
+    for alpha, expected in ((0.3, 0.01), (0.01, 0.005), (1e-4, 5e-5)):
+        params = mi.traverse(load(alpha_v=alpha))
+        assert params["micro_alpha"][0] == pytest.approx(expected)

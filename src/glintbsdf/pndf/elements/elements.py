@@ -654,7 +654,7 @@ class Elements(Mixture):
         kernel = query.texel_kernel("gaussian", height, width, self.wrap_mode)
         narrow = kernel.minor_variance < COARSE.narrowest(1) ** 2
         points = mean_over_points(
-            self, kernel, directions, active & narrow, False, dr.square(self.sigma_r)
+            self, kernel, directions, active & narrow, None, dr.square(self.sigma_r)
         )
         averages = super().areas_of_many(directions, query, active & ~narrow)
         return choose_areas(narrow, points, averages)

@@ -43,6 +43,7 @@ import numpy as np
 
 from glintbsdf.core.hashing import pcg3d
 from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.opaque import opaque
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel, difference_of_products, gaussian_like
@@ -575,7 +576,7 @@ def mean_over_points(
     kernel: TexelKernel,
     directions: list,
     active: mi.Bool,
-    jumps: bool,
+    jumps: mi.Bool | None,
     roughness: mi.Float | float = 0.0,
 ) -> tuple[list, mi.Vector2f]:
     """P(ω) for each direction, and the mean slope, as means over N points of the kernel.
@@ -593,8 +594,8 @@ def mean_over_points(
         kernel: the footprint's kernel.
         directions: unit vectors ω.
         active: mask of the lanes.
-        jumps (bool): whether the mesh has degenerate triangles, see
-            :func:`has_degenerate_triangles`.
+        jumps (mi.Bool): whether the mesh has degenerate triangles, see
+            :func:`has_degenerate_triangles`; None for an object that has no triangles.
         roughness: variance of the projected normals of every facet.
     """
     quads, count = kernel.touched_quads(), mi.UInt32(POINTS[-1][1])
@@ -606,7 +607,7 @@ def mean_over_points(
         x, y = ((mi.Float(k) + 0.5) * step for step in (share, GOLDEN))
         offset = kernel.sample(mi.Point2f(x, y - dr.floor(y)))
         m, e1, e2, degenerate = mesh.frame_at(kernel.mean + offset, active)
-        counts = active & ~degenerate if jumps else active
+        counts = active if jumps is None else active & ~(degenerate & jumps)
         z = height_of(m)
         new = []
         for w, total in zip(directions, totals, strict=True):
@@ -624,9 +625,11 @@ def mean_over_points(
     )
     share = dr.rcp(mi.Float(dr.maximum(found, 1)))
     areas, slope = [area * share for area in areas], slope * share
-    if not jumps:
+    if jumps is None:
         return areas, slope
-    mass, single_slope, *single_areas = degenerate_triangles(mesh, kernel, directions, active)
+    mass, single_slope, *single_areas = degenerate_triangles(
+        mesh, kernel, directions, active & jumps
+    )
     # The rest of the mass belongs to the points, if there are any.
     rest = dr.select(found > 0, dr.maximum(1 - mass, 0), 0)
     mass = dr.maximum(mass + rest, 1e-6)
@@ -636,8 +639,9 @@ def mean_over_points(
     return areas, (slope * rest + single_slope) / mass
 
 
-def has_degenerate_triangles(mesh: TexelMesh) -> bool:
-    """Whether any triangle of a mesh is replaced by an equilateral one."""
+def has_degenerate_triangles(mesh: TexelMesh) -> mi.Bool:
+    """Whether any triangle of a mesh is replaced by an equilateral one; opaque, as kernels are the
+    same for all maps."""
     with dr.suspend_grad():
         index = dr.arange(mi.UInt32, mesh.lattice.x.quads * mesh.lattice.y.quads)
         columns = mi.UInt32(mesh.lattice.x.count)
@@ -645,7 +649,7 @@ def has_degenerate_triangles(mesh: TexelMesh) -> bool:
         n0, n1, n2, n3 = mesh.quad_normals(mi.Int(row), mi.Int(index - row * columns))
         any_of = is_degenerate(n0, (n1, n2), mesh.epsilon)
         any_of |= is_degenerate(n3, (n1, n2), mesh.epsilon)
-        return bool(dr.any(any_of))
+        return opaque(mi.Bool, bool(dr.any(any_of)))
 
 
 def degenerate_triangles(mesh: TexelMesh, kernel: TexelKernel, directions: list, active) -> tuple:

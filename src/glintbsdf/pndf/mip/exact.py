@@ -226,7 +226,7 @@ class Patches(Elements):
             self.texel_kernel(query),
             directions,
             active & ~few,
-            False,
+            None,
             dr.square(self.sigma_r),
         )
         return choose_areas(few, summed, points)
