@@ -29,7 +29,7 @@ Glitter without a map, from a handful of flakes to more than anyone could count,
 
  * - micro_alpha
    - |float|
-   - Beckmann roughness of a single facet. Greater than 0: a perfect mirror would show nothing of a
+   - Beckmann roughness of a single facet. At least 1e-6: a perfect mirror would show nothing of a
      small light but by chance. At most half of the least :monosp:`alpha`, as all facets together
      are rougher than each. (Default: 0.01, or this limit where it is less)
    - |exposed|, |differentiable|

@@ -77,6 +77,7 @@ def test_to_uv(variant):
     for transform in (
         mi.ScalarTransform4f().scale([1, 0, 1]),
         mi.ScalarTransform4f().translate([float("nan"), 0, 0]),
+        mi.ScalarTransform4f().scale([1, 1e8, 1]),
     ):
         with pytest.raises(ParameterError, match='"to_uv" must be a finite, invertible'):
             parameters(to_uv=transform).to_uv()

@@ -318,6 +318,7 @@ BAD_OWN_PARAMETERS = [
     ({"alpha": 0.3, "alpha_u": 0.2}, "alpha"),
     ({"alpha_v": -0.1}, "alpha_v"),
     ({"micro_alpha": 0.0}, "micro_alpha"),
+    ({"micro_alpha": 1e-45}, "micro_alpha"),
     ({"micro_alpha": 0.16}, "micro_alpha"),
     ({"micro_alpha": 0.2, "distribution": "beckmann"}, "micro_alpha"),
     ({"alpha_v": 0.01, "micro_alpha": 0.01}, "micro_alpha"),

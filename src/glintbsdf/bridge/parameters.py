@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from difflib import get_close_matches
-from math import isfinite, pi
+from math import pi
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +32,11 @@ from glintbsdf.maps.reading import is_file
 from glintbsdf.microfacet.interface import Conductor, Dielectric, Interface, Mirror
 
 MAP_SOURCES = ("filename", "bitmap", "data")
+
+
+#: The largest entry of a transform. Far beyond it, squares of footprints and their products leave
+#: the range of float32.
+LARGEST_ENTRY = 1e7
 
 
 class Number(NamedTuple):
@@ -193,7 +198,7 @@ PARAMETERS: Mapping[str, Mapping[str, Number | Kind]] = {
         **_MATERIAL,
         "distribution": NAME,
         **{f"alpha{axis}": _ROUGHNESS for axis in ("", "_u", "_v")},
-        "micro_alpha": Number(0, 10, above=True),
+        "micro_alpha": Number(1e-6, 10),
         "density": Number(-8, 16),
         "colors": COLORS,
         "color": SPECTRUM,
@@ -578,27 +583,27 @@ class Parameters:
 
 
 def check_to_uv(owner: str, to_uv: mi.ScalarAffineTransform3f) -> None:
-    """Raise :class:`~.ParameterError` unless a transform of the UV plane is finite and
-    invertible."""
+    """Raise :class:`~.ParameterError` unless a transform of the UV plane is invertible, and no
+    entry is beyond :data:`LARGEST_ENTRY`."""
     matrix = to_uv.matrix
     entries = [float(matrix[row, column]) for row in range(2) for column in range(3)]
     determinant = entries[0] * entries[4] - entries[1] * entries[3]
     check(
-        all(map(isfinite, entries)) and determinant != 0,
+        all(abs(entry) <= LARGEST_ENTRY for entry in entries) and determinant != 0,
         owner,
         "to_uv",
-        "a finite, invertible transform of the UV plane",
+        f"a finite, invertible transform of the UV plane, with entries up to {LARGEST_ENTRY:g}",
         entries,
     )
 
 
 def check_transform(owner: str, name: str, transform: mi.ScalarAffineTransform4f) -> None:
-    """Refuse a transform of space that is not finite or not invertible."""
+    """Refuse a transform of space that is not invertible, or beyond :data:`LARGEST_ENTRY`."""
     matrix = np.array(transform.matrix, np.float64)
     check(
-        np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0,
+        (np.abs(matrix) <= LARGEST_ENTRY).all() and np.linalg.det(matrix[:3, :3]) != 0,
         owner,
         name,
-        "a finite, invertible transform",
+        f"a finite, invertible transform, with entries up to {LARGEST_ENTRY:g}",
         matrix.tolist(),
     )
