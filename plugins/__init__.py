@@ -67,7 +67,8 @@ described here:
 
  * - to_uv
    - |transform|
-   - Transform of the UV coordinates, as for a bitmap texture. (Default: none)
+   - Transform of the UV coordinates, as for a bitmap texture. It is invertible, and its entries
+     are at most 1e7. (Default: none)
    - |exposed|
 
  * - footprint_sigma

@@ -167,7 +167,7 @@ from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.query import Place
 from glintbsdf.pndf import Particles
 from glintbsdf.pndf.colors import Palette, Wheel, varied
-from glintbsdf.pndf.particles.particles import ROUGHEST
+from glintbsdf.pndf.particles.particles import usual_micro_alpha
 
 VARIATIONS = ("hue_variation", "saturation_variation", "value_variation")
 
@@ -191,7 +191,7 @@ class GlintParticles(GlintBSDF):
         self.options = {
             "alpha": alpha,
             "density": parameters.number("density", 8.0),
-            "micro_alpha": parameters.number("micro_alpha", min(0.01, ROUGHEST * min(alpha))),
+            "micro_alpha": parameters.number("micro_alpha", usual_micro_alpha(alpha)),
             "distribution": distribution,
             "colors": self.colors(parameters),
             "seed": parameters.whole("seed", 0),

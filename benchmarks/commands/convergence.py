@@ -4,14 +4,15 @@ The scene is a ball with a map of bumps, under four spherical lights, from nearl
 softbox, or under a studio. Footprints have from 1 to 60 texels per pixel. *Sampling alone* is
 ``path`` with footprints of no size: it sees single elements, as Mitsuba's own integrators see the
 texels of a normal map. Its mean is the truth, whose own noise is measured and subtracted.
-``roughconductor`` has the roughness of the whole map.
+``roughconductor`` has the roughness of the whole map. There is no masking: that of a footprint is
+not the mean of that of its points.
 
 Errors are over the contrast of the truth, its standard deviation over the pixels. *Robust* leaves
-out the thousandth of the pixels with the largest errors. *Bias* is the error of the mean of all
-seeds, *deviation* their noise. *Factor* is the squared error that sampling alone has after the same
-time, over that of the row; an error below a tenth of the truth's noise counts as this. *To reach*
-are the seconds until the error is a tenth of the contrast, at the rate of the row. With ``-o``,
-``convergence.csv`` has the rows of 16 samples per pixel.
+out the thousandth of the pixels with the largest errors. *Bias* is the error without the noise of
+the samples, *deviation* this noise. *Factor* is the squared error that sampling alone has after the
+same time, over that of the row; an error below a tenth of the truth's noise counts as this. *To
+reach* are the seconds until the error is a tenth of the contrast, at the rate of the row. With
+``-o``, ``convergence.csv`` has the rows of 16 samples per pixel.
 
 Expected before measuring: the smaller the light and the larger the footprint, the larger the
 factor; hundreds under a sun, a few under a softbox; about 1 under the studio, whose light comes
@@ -71,16 +72,17 @@ def lights(light: str) -> dict:
     }
 
 
-def ball(bsdf: dict, light: str, texels: float, size: int = SIZE) -> mi.Scene:
-    """The scene for images of ``size``² pixels, with ``texels`` per pixel at its middle."""
+def repeated(texels: float, size: int = SIZE) -> mi.ScalarTransform4f:
+    """The ``to_uv`` for ``texels`` per pixel in the middle of images of ``size``² pixels."""
     pixel = 2 * (CAMERA - 1) * np.tan(np.radians(FIELD_OF_VIEW / 2)) / size
     around = texels / pixel * 2 * np.pi / TEXELS  # maps around the ball, whose seam is not seen
-    to_uv = mi.ScalarTransform4f().scale([around, around / 2, 1])
-    shape = {
-        "type": "sphere",
-        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
-        "bsdf": {**bsdf, "to_uv": to_uv} if "roughconductor" not in bsdf["type"] else bsdf,
-    }
+    return mi.ScalarTransform4f().scale([around, around / 2, 1])
+
+
+def ball(bsdf: dict, light: str, size: int = SIZE) -> mi.Scene:
+    """The scene for images of ``size``² pixels."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    shape = {"type": "sphere", "to_world": turned, "bsdf": bsdf}
     return picture_of(shape, [0, 0, CAMERA], [0, 1, 0], FIELD_OF_VIEW, size, lights(light),
                       rfilter="gaussian")  # fmt: skip
 
@@ -114,20 +116,21 @@ def measured(
 ) -> list[dict]:
     """All rows of a method under a light."""
     seeds, spp, budgets = (3, 8192, (4, 16, 64)) if quick else (5, 32768, BUDGETS)
-    bsdf = {**method.describe(surface), "masking": "none"}
-    alone = ball({**bsdf, "pixel_spread": NOTHING}, light, texels)
+    to_uv = repeated(texels)
+    bsdf = {**method.describe(surface), "masking": "none", "to_uv": to_uv}
+    alone = ball({**bsdf, "pixel_spread": NOTHING}, light)
     truth = reference_render(alone, spp)
     by_chance = errors(alone, "path", ALONE, truth, seeds)
     rows = [{"by": "sampling alone", "spp": ALONE, **by_chance}]
     for by, integrator, material in (
         ("glint_path", "glint_path", bsdf),
-        ("roughconductor", "path", rough(surface.normal_map)),
+        ("roughconductor", "path", rough(surface.normal_map, to_uv)),
     ):
-        scene = ball(material, light, texels)
+        scene = ball(material, light)
         for n in budgets if by == "glint_path" else budgets[-1:]:
             rows.append({"by": by, "spp": n, **errors(scene, integrator, n, truth, seeds)})
     work = by_chance["error"] ** 2 * by_chance["seconds"]
-    noise = float(np.sqrt((truth.standard_error**2).mean()) / truth.image.std())
+    noise = float(truth.noise / truth.image.std())
     for row in rows:
         reached = row["by"] == "sampling alone" or row["error"] <= REACHED
         row["factor"] = work / (row["seconds"] * max(row["error"], LEAST * noise) ** 2)
@@ -139,7 +142,7 @@ def measured(
 def lit(run: Run) -> None:
     """Errors and factors by light, texels per pixel, method and samples per pixel."""
     surface = Surface("bumps", maps.isotropic(TEXELS, alpha=0.16, correlation_length=6, seed=11))
-    # All without masking, which LEADR cannot be
+    # LEADR is its masking
     compared = [m for m in METHODS if m.image and m.mapped and m.setting != "leadr"]
     compared = [m for m in compared if m.name in QUICK] if run.quick else compared
     with run.table("images") as table:

@@ -196,7 +196,7 @@ def convergence(name: str, rows: list[dict]) -> Figure:
             alone = next(row for row in points if row["by"] == "sampling alone")
             chance = alone["error"] * np.sqrt(alone["seconds"] / at)
             axis.plot(at, chance, ":", **look)
-        axis.axhline(own[0]["noise_of_truth"], linestyle="--", color="#777777", linewidth=0.9)
+            axis.axhline(alone["noise_of_truth"], linestyle="--", alpha=0.6, **look)
         axis.set(xscale="log", yscale="log", title=f"{light}, {texels:g} texels a pixel")
         label_logarithmic(axis.xaxis, axis.yaxis)
         axis.set_xlabel("seconds of rendering")

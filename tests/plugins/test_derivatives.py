@@ -93,6 +93,15 @@ def test_the_manifold_under_integrated_lights(variant):
     assert derivative.right and derivative.noise < 0.01 * abs(derivative.difference), derivative
 
 
+def test_merged_elements_under_integrated_lights(variant):
+    """Sharp elements in a wide footprint, under a wide lamp: merged elements answer."""
+    to_uv = mi.ScalarTransform4f().scale([10, 10, 1])
+    settings = {"sigma_r": 0.005, "footprint_sigma": 6.0, "masking": "none", "to_uv": to_uv}
+    plate = two_sided(bsdf("elements", **settings))
+    (derivative,) = render_derivatives(plate, ["data"], "glint_path", lamp="sphere", spp=64)
+    assert derivative.right and derivative.noise < 0.01 * abs(derivative.difference), derivative
+
+
 @pytest.mark.parametrize("integrator", ["prb", "path", "glint_path"])
 def test_derivative_in_forward_mode(variant, integrator):
     plate = two_sided(bsdf("elements", masking="none"))

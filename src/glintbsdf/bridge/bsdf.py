@@ -25,6 +25,7 @@ from glintbsdf.footprint.domain import Domain, Gate, Recorder
 from glintbsdf.footprint.gaussian import Footprint, is_literal_zero
 from glintbsdf.footprint.query import Place, Query
 from glintbsdf.maps.normalmap import MapShape, NormalMap
+from glintbsdf.microfacet.frame import normal_from_projection
 from glintbsdf.microfacet.interface import Component, Mirror
 from glintbsdf.microfacet.masking import SmithMasking
 from glintbsdf.microfacet.slope_frame import SlopeFrame
@@ -37,11 +38,15 @@ _alive: WeakSet[FootprintBSDF] = WeakSet()
 
 
 def prepare_for_lights() -> None:
-    """Make all that BSDFs need to integrate lights, before a kernel is recorded that asks them."""
-    for bsdf in list(_alive):
-        pndf = getattr(bsdf, "pndf", None)
-        if pndf is not None and bsdf.integrates_lights:
-            pndf.prepare_for_lights()
+    """Make all that BSDFs need to integrate lights, before a kernel is recorded that asks them.
+
+    An integrator may ask while it suspends derivatives, and use what is made when it does not.
+    """
+    with dr.resume_grad():
+        for bsdf in list(_alive):
+            pndf = getattr(bsdf, "pndf", None)
+            if pndf is not None and bsdf.integrates_lights:
+                pndf.prepare_for_lights()
 
 
 class MakesOpaque:
@@ -537,7 +542,10 @@ class GlintBSDF(FootprintBSDF):
         m = component.half_vector(wi, wo)
         query = self.query(si, active, wi, wo)
         facets = self.facets(ctx, si, active)
-        density = self.density(facets.pndf, query.centre(m), query, si, active)
+        centre = m
+        if query.shift is not None:
+            centre = normal_from_projection(mi.Vector2f(m.x, m.y) + query.shift)
+        density = self.density(facets.pndf, centre, query, si, active)
         value = component.value(density, wi.z)
         pdf = facets.pndf.visible_pdf(wi, m, density, query, active)
         return (

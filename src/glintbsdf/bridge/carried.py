@@ -94,9 +94,7 @@ class Carried:
 
         With m = (ω_i + ω_o)/|ω_i + ω_o|, dm = (I − m mᵀ) dω_o/|ω_i + ω_o|.
         """
-        h = wi + wo
-        inverse = dr.rcp(dr.maximum(dr.norm(h), 1e-6))
-        m = h * inverse
+        m, inverse = half_vector(wi, wo)
         scale = dr.sqrt(self.variance) * inverse
         return tuple(
             mi.Vector2f(v.x, v.y) * scale
@@ -104,20 +102,26 @@ class Carried:
         )
 
     def shift(self, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Vector2f:
-        """What the mean of the light's projected half vectors differs by from that of its centre.
+        """The vector from the projected half vector of the light's centre to the mean of the
+        light's.
 
         The half vector is not linear in ω_o. Under a light of 0.2 radians this shift changes
-        densities by some hundredths. The mean is that of four points of the light, which have its
+        densities by some hundredths. Four points of the light stand for it, as they have its
         covariance.
         """
-        step = dr.sqrt(2 * self.variance)
-        mean = mi.Vector2f(0)
+        step, shift = dr.sqrt(2 * self.variance), -half_vector(wi, wo)[0]
         for axis in mi.coordinate_system(wo):
-            for offset in (step * axis, -step * axis):
-                m = dr.normalize(wi + dr.normalize(wo + offset))
-                mean = mean + 0.25 * mi.Vector2f(m.x, m.y)
-        centre = dr.normalize(wi + wo)
-        return dr.select(self.variance > 0, mean - mi.Vector2f(centre.x, centre.y), 0)
+            for sign in (1, -1):
+                point = dr.normalize(wo + sign * step * axis)
+                shift = shift + 0.25 * half_vector(wi, point)[0]
+        return dr.select(self.variance > 0, mi.Vector2f(shift.x, shift.y), 0)
+
+
+def half_vector(wi: mi.Vector3f, wo: mi.Vector3f) -> tuple[mi.Vector3f, mi.Float]:
+    """m = (ω_i + ω_o)/|ω_i + ω_o|, and 1/|ω_i + ω_o|; finite where the two are opposite."""
+    h = wi + wo
+    inverse = dr.rcp(dr.maximum(dr.norm(h), 1e-6))
+    return h * inverse, inverse
 
 
 def half_vector_turn(
@@ -140,9 +144,7 @@ def half_vector_turn(
         inverse_distance: of the light; 0 for one at infinity.
     """
     wi = si.to_world(si.wi)
-    h = wi + wo
-    inverse = dr.rcp(dr.maximum(dr.norm(h), 1e-6))
-    m = h * inverse
+    m, inverse = half_vector(wi, wo)
     cosine = dr.dot(m, mi.Vector3f(si.sh_frame.n))
     result = []
     for dwi, dp, dn in ((dwi_du, si.dp_du, si.dn_du), (dwi_dv, si.dp_dv, si.dn_dv)):

@@ -155,9 +155,14 @@ class Truth:
         return f"Truth({size}, relative error {self.relative_error:.2%})"
 
     @property
+    def noise(self) -> float:
+        """Standard deviation of the noise, over all pixels."""
+        return float(np.sqrt((self.standard_error**2).mean()))
+
+    @property
     def relative_error(self) -> float:
-        """Standard deviation of the noise over the mean of the image, both over all pixels."""
-        return float(np.sqrt((self.standard_error**2).mean()) / self.image.mean())
+        """The noise over the mean of the image."""
+        return float(self.noise / self.image.mean())
 
     def relative_rmse(self, image: np.ndarray) -> float:
         """Root mean square difference of another image, over the mean of this one.
@@ -165,7 +170,7 @@ class Truth:
         The noise of this image is subtracted; the result is 0 if it exceeds the difference.
         """
         squared = ((np.asarray(image, np.float64) - self.image) ** 2).mean()
-        squared -= (self.standard_error**2).mean()
+        squared -= self.noise**2
         return float(np.sqrt(max(squared, 0)) / self.image.mean())
 
 

@@ -1,4 +1,4 @@
-"""Loops that sum, and their derivatives.
+"""Loops that sum, branches inside of them, and their derivatives.
 
 A differentiable loop of Dr.Jit (1.5), ``dr.while_loop(…, max_iterations=-1)``, propagates the
 derivatives of its state and of arrays in memory that its body gathers from. But the body may also
@@ -316,3 +316,23 @@ WAYS: dict[type, Callable] = {
     partial: into_partial,
     FunctionType: into_function,
 }
+
+
+def add_where(density, condition, added, active):
+    """``density + added()`` in the lanes where the condition holds, by a branch.
+
+    With derivatives there is no branch: Dr.Jit (1.5) cannot record them through a branch in a loop.
+    """
+    if dr.grad_enabled(added()):
+        return density + dr.select(condition, added(), 0)
+    return dr.if_stmt(
+        (density,), active & condition, lambda density: density + added(), lambda density: density
+    )
+
+
+def where_needed(needed, added, sums: tuple) -> tuple:
+    """``added(*sums)`` in the lanes that need it, and ``sums`` in all others; by a branch, under
+    the same condition as in :func:`add_where`."""
+    if dr.grad_enabled(added(*sums)):
+        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
+    return dr.if_stmt(sums, needed, added, lambda *sums: sums)

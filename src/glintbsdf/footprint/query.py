@@ -21,7 +21,6 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.footprint.gaussian import Footprint, tangent_to_uv
@@ -94,13 +93,6 @@ class Query:
     def at(self, footprint: Footprint) -> Query:
         """The same query with another footprint."""
         return Query(footprint, self.turn, self.spread, self.parameters, self.place, self.shift)
-
-    def centre(self, m: mi.Vector3f) -> mi.Vector3f:
-        """The unit normal about which the spread averages, where ``m`` is asked for."""
-        if self.shift is None:
-            return m
-        s = mi.Vector2f(m.x, m.y) + self.shift
-        return mi.Vector3f(s.x, s.y, dr.copysign(dr.safe_sqrt(1 - dr.squared_norm(s)), m.z))
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
         """The result of ``make()``, which is called on first use only.

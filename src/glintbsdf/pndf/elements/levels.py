@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.loops import add_where, symbolic_loop
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import TexelKernel, difference_of_products
 from glintbsdf.footprint.lattice import floor_int
@@ -277,15 +277,13 @@ class Levels:
                 of_light = form_of_adjoint(light.xx, light.xy, light.yy, delta)
                 near = form + of_light < LIGHT_CUT * (determinant + mixed + light.determinant)
                 # The rays of a pixel agree on what is near, so far elements are skipped
-                seen = dr.if_stmt(
-                    (determinant, mixed, form, of_light),
-                    inside & near,
-                    lambda determinant, mixed, form, of_light: averaged_over_ellipse(
+                seen = add_where(
+                    mi.Float(0),
+                    near,
+                    lambda: averaged_over_ellipse(
                         (determinant, mixed, light.determinant), (form, of_light)
                     ),
-                    lambda *_: mi.Float(0),
-                    mode="symbolic",
-                    label="element in light",
+                    inside,
                 )
             else:
                 inverse_root = dr.rsqrt(determinant)

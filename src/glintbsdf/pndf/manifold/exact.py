@@ -118,16 +118,15 @@ class Manifold(TexelMesh, PNDF):
         are averaged over them as Gaussians, of which the elements are a mixture."""
         if self.lit is not None:
             return
-        with dr.resume_grad():  # an integrator may ask while it suspends derivatives
-            self.lit = Elements(
-                self.normal_map,
-                LIT_ROUGHNESS,
-                owner=self.owner,
-                domain=self.domain,
-                data=None if self.stand_in is None else self.data,
-                listed=LISTED,
-            )
-            self.lit.prepare_for_lights()
+        self.lit = Elements(
+            self.normal_map,
+            LIT_ROUGHNESS,
+            owner=self.owner,
+            domain=self.domain,
+            data=None if self.stand_in is None else self.data,
+            listed=LISTED,
+        )
+        self.lit.prepare_for_lights()
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         """Check new data, and rebuild. Derivatives keep flowing to the data."""

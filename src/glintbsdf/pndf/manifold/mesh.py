@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from glintbsdf.core.errors import check, check_choice
+from glintbsdf.core.loops import add_where
 from glintbsdf.core.opaque import stored
 from glintbsdf.footprint.gaussian import Footprint
 from glintbsdf.footprint.kernels import KERNELS, TexelKernel
@@ -103,26 +104,6 @@ def frame_in_quad(l1, l2, normals, epsilon):
 # ------------------------------------------------------------------------------------------------
 #  Eq. 5: evaluation
 # ------------------------------------------------------------------------------------------------
-
-
-def add_where(density, condition, added, active):
-    """``density + added()`` in the lanes where the condition holds, by a branch.
-
-    With derivatives there is no branch: Dr.Jit (1.5) cannot record them through a branch in a loop.
-    """
-    if dr.grad_enabled(added()):
-        return density + dr.select(condition, added(), 0)
-    return dr.if_stmt(
-        (density,), active & condition, lambda density: density + added(), lambda density: density
-    )
-
-
-def where_needed(needed: mi.Bool, added, sums: tuple) -> tuple:
-    """``added(*sums)`` in the lanes that need it, and ``sums`` in all others; by a branch, under
-    the same condition as in :func:`add_where`."""
-    if dr.grad_enabled(added(*sums)):
-        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
-    return dr.if_stmt(sums, needed, added, lambda *sums: sums)
 
 
 def quad_density(m, corner, kernel, normals, epsilon, active):

@@ -42,7 +42,7 @@ import mitsuba as mi
 import numpy as np
 
 from glintbsdf.core.hashing import pcg3d
-from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.loops import add_where, symbolic_loop, where_needed
 from glintbsdf.core.opaque import opaque
 from glintbsdf.footprint.domain import Domain
 from glintbsdf.footprint.gaussian import Footprint
@@ -65,12 +65,10 @@ from glintbsdf.pndf.filters.moments import COARSE, MomentPyramid
 from glintbsdf.pndf.index.lists import every_quad
 from glintbsdf.pndf.manifold.mesh import (
     TexelMesh,
-    add_where,
     cross,
     is_degenerate,
     normal_in_quad,
     triangles_of_quad,
-    where_needed,
 )
 from glintbsdf.pndf.sharing import shared
 

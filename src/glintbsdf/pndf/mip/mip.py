@@ -23,7 +23,7 @@ import numpy as np
 from glintbsdf.core.cache import load_or_build
 from glintbsdf.core.errors import check, check_whole
 from glintbsdf.core.hashing import pcg3d, uniform
-from glintbsdf.core.loops import symbolic_loop
+from glintbsdf.core.loops import add_where, symbolic_loop, where_needed
 from glintbsdf.core.messages import warn
 from glintbsdf.core.tuning import tuning
 from glintbsdf.footprint.domain import Domain
@@ -36,7 +36,6 @@ from glintbsdf.microfacet.mean_plane import lobe_area, slope_of
 from glintbsdf.pndf.base import PNDF, changed_map, register
 from glintbsdf.pndf.elements.elements import check_sigma_r, cut_of_lists, mass_under_fade
 from glintbsdf.pndf.gaussian_elements import SIGMA_H, lattice_mass, point_of_ellipse
-from glintbsdf.pndf.manifold.mesh import add_where, where_needed
 from glintbsdf.pndf.mip import levels as lobe_levels
 from glintbsdf.pndf.mip.cells import LevelCells
 from glintbsdf.pndf.mip.packing import NORMAL_CUT, Lobe

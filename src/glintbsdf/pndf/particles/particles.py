@@ -60,6 +60,9 @@ from glintbsdf.pndf.smooth import MIN_ALPHA, SmoothSurface
 #: The roughest facet, relative to the surface.
 ROUGHEST = 0.5
 
+#: Roughness of a facet where none is given and the surface allows it, and the smallest one allowed.
+USUAL_MICRO_ALPHA, LEAST_MICRO_ALPHA = 0.01, 1e-6
+
 #: Normals lower than this count as so high where a slope's variance is carried to the disk.
 LOWEST = 0.05
 
@@ -198,7 +201,8 @@ class Particles(PNDF):
         alpha (pair of floats): roughness of all facets together along u and v, ≥ 1e-4.
         density (float): log10 of the number of facets per unit of UV area, in [−8, 16]; where
             queries have a place in space, per unit of area there.
-        micro_alpha (float): Beckmann roughness of one facet, > 0, at most half of the least α.
+        micro_alpha (float): Beckmann roughness of one facet, ≥ 1e-6, at most half of the least α;
+            None for :func:`usual_micro_alpha`.
         distribution (str): ``ggx`` or ``beckmann``.
         colors (Wheel, Palette or None): colours of the facets.
         seed (int): another one gives other facets, in [0, 2³²).
@@ -222,7 +226,7 @@ class Particles(PNDF):
         self,
         alpha=(0.3, 0.3),
         density=8.0,
-        micro_alpha=0.01,
+        micro_alpha=None,
         distribution="ggx",
         colors=None,
         seed=0,
@@ -237,6 +241,8 @@ class Particles(PNDF):
             seed,
         )
         self.distribution, self.colors, self.owner = distribution, colors, owner
+        if micro_alpha is None:
+            micro_alpha = usual_micro_alpha(alpha)
         values = dict(zip(self.NAMES, (*alpha, density, micro_alpha), strict=True))
         check_ranges(values, owner)
         for name, value in values.items():
@@ -465,6 +471,11 @@ def split_sample(sample: mi.Float, chance: mi.Float) -> tuple[mi.Bool, mi.Float]
     return below, dr.clip((sample - low) / dr.maximum(width, 1e-8), 0, 1)
 
 
+def usual_micro_alpha(alpha) -> float:
+    """The roughness of facets of a surface with the roughness ``alpha`` along u and v."""
+    return min(USUAL_MICRO_ALPHA, ROUGHEST * min(alpha))
+
+
 def check_ranges(values: dict[str, float], owner: str) -> None:
     """Raise ``ParameterError`` unless all numbers of :class:`Particles` are in range."""
     for axis in "uv":
@@ -474,10 +485,10 @@ def check_ranges(values: dict[str, float], owner: str) -> None:
     most = ROUGHEST * min(values["alpha_u"], values["alpha_v"])
     micro_alpha = values["micro_alpha"]
     check(
-        isfinite(micro_alpha) and 0 < micro_alpha <= 1.000001 * most,
+        isfinite(micro_alpha) and 0.999 * LEAST_MICRO_ALPHA <= micro_alpha <= 1.000001 * most,
         owner,
         "micro_alpha",
-        "greater than 0, as a perfect mirror shows nothing of a point light, and at most "
+        f"at least {LEAST_MICRO_ALPHA:g}, as a mirror shows nothing of a point light, and at most "
         f"{most:g}, half of the least alpha, as all facets together are rougher than each",
         micro_alpha,
     )
