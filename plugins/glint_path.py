@@ -88,9 +88,10 @@ the image does.
 
 **Small lights are sampled at every hit**, as the noise of a random choice would be large on glints.
 One of the remaining emitters, environments among them, is chosen in proportion to its
-``sampling_weight``. If only the environment remains, BSDFs that integrate lights look for it by
-BSDF sampling alone, unless they have a diffuse lobe: a direction of the environment mostly meets no
-glint, and the P-NDF there costs as much as that of a good direction.
+``sampling_weight``. If only the environment remains, :ref:`glint_manifold <bsdf-glint_manifold>`,
+:ref:`glint_elements <bsdf-glint_elements>` and the lobes of :ref:`glint_mip <bsdf-glint_mip>` look
+for it by BSDF sampling alone, unless a diffuse lobe is beside them. Their P-NDF in a direction of
+the environment costs as much as in a direction of their own, and mostly no glint is there.
 
 **The P-NDF integrates small lights** in BSDFs that are able to do so, which are
 :ref:`glint_elements <bsdf-glint_elements>`, :ref:`glint_manifold <bsdf-glint_manifold>`,
@@ -171,6 +172,7 @@ import mitsuba as mi
 from glintbsdf.bridge import filter_sampling
 from glintbsdf.bridge.bsdf import prepare_for_lights
 from glintbsdf.bridge.carried import (
+    FINDS_ENVIRONMENT,
     HAS_FOOTPRINT,
     INTEGRATES_LIGHTS,
     Carried,
@@ -576,12 +578,12 @@ class Hit:
 
     @property
     def finds_environment(self) -> mi.Bool:
-        """Whether BSDF sampling alone looks for the environment. Its bright regions are lights, and
-        in the rest an emitter sample costs as much as one of the BSDF and tells less, unless the
-        BSDF has a diffuse lobe."""
-        if not self.lights.others_are_environments:
+        """Whether BSDF sampling alone looks for the environment, whose bright regions are lights.
+        It never does for a diffuse lobe."""
+        if self.shares is None or not self.lights.others_are_environments:
             return mi.Bool(False)
-        return self.integrates & ~mi.has_flag(self.bsdf.flags(), mi.BSDFFlags.Diffuse)
+        flags = self.bsdf.flags()
+        return ((flags & FINDS_ENVIRONMENT) != 0) & ~mi.has_flag(flags, mi.BSDFFlags.Diffuse)
 
     def finds_all_lights(self) -> mi.Bool:
         """Whether emitter sampling finds all lights, so that BSDF sampling need not."""

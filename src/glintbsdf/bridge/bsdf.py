@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from glintbsdf.bridge.carried import HAS_FOOTPRINT, INTEGRATES_LIGHTS, Carried
+from glintbsdf.bridge.carried import FINDS_ENVIRONMENT, HAS_FOOTPRINT, INTEGRATES_LIGHTS, Carried
 from glintbsdf.bridge.parameters import EXTINCTION, Parameters, check_to_uv, declared_range
 from glintbsdf.bridge.separation import asks_for_smooth_lobes
 from glintbsdf.bridge.spectra import ColorConversion
@@ -384,7 +384,8 @@ class GlintBSDF(FootprintBSDF):
     def finish(self, method: type[PNDF] = PNDF) -> None:
         """End a subclass's constructor: build, unless ``deferred``.
 
-        ``method``: class of the P-NDF, which states whether it integrates lights.
+        ``method``: class of the P-NDF, which states whether it integrates lights, and whether its
+        samples alone find the environment.
         """
         reflects = all(
             bool(int(c.flags) & int(mi.BSDFFlags.GlossyReflection))
@@ -392,8 +393,9 @@ class GlintBSDF(FootprintBSDF):
         )
         if method.integrates_lights and reflects:
             self.integrates_lights = True
-            self.m_components = [flags | INTEGRATES_LIGHTS for flags in self.m_components]
-            self.m_flags |= INTEGRATES_LIGHTS
+            able = INTEGRATES_LIGHTS | (FINDS_ENVIRONMENT if method.finds_environment else 0)
+            self.m_components = [flags | able for flags in self.m_components]
+            self.m_flags |= able
         if not self.deferred:
             in_turn(self.build)
         elif self.normal_map is not None:

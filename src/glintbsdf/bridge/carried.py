@@ -12,8 +12,8 @@ surface interaction reach a BSDF. BSDFs do not use the derivatives of the normal
 * along the geometric normal, the logarithm of the light's variance, and a mark that all this is
   not the derivative of a normal. The normal is perpendicular to its derivatives, so there is room.
 
-A bit of the flags that Mitsuba does not use marks BSDFs that integrate lights. Wrappers
-unite the flags of the BSDFs inside, so they have the bit, too.
+Bits of the flags that Mitsuba does not use mark such BSDFs. Wrappers unite the flags of the BSDFs
+inside, so they have these bits, too.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ import mitsuba as mi
 
 from glintbsdf.footprint.gaussian import is_literal_zero
 
-#: Bits of ``BSDFFlags``, of BSDFs that integrate lights, and of all that average over footprints;
-#: those of Mitsuba 3.9 end at bit 16.
+#: Bits of ``BSDFFlags``, of BSDFs that integrate lights, of all that average over footprints, and
+#: of those whose own samples alone look for an environment; those of Mitsuba 3.9 end at bit 16.
 INTEGRATES_LIGHTS = 1 << 30
 HAS_FOOTPRINT = 1 << 29
+FINDS_ENVIRONMENT = 1 << 28
 
 #: The component along the normal of ``dn_dv`` if the interaction carries data.
 MARK = 1.0

@@ -71,6 +71,10 @@ class PNDF(ABC):
     #: of some extent.
     integrates_lights: ClassVar[bool] = False
 
+    #: Whether samples of D alone look for an environment, where lights are integrated: a value of D
+    #: then costs more than a sample of the environment tells.
+    finds_environment: ClassVar[bool] = False
+
     #: Parameters on which the roughness of the whole surface depends.
     roughness_keys: ClassVar[tuple[str, ...]] = ("data", "sigma_r")
 

@@ -547,7 +547,7 @@ class Elements(Mixture):
     """
 
     normal_map: NormalMap
-    integrates_lights = True
+    integrates_lights = finds_environment = True
     bytes_per_texel = 110.0
 
     #: Mahalanobis distance at which the lists cut an element's normals.

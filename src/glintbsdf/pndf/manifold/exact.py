@@ -63,7 +63,7 @@ class Manifold(TexelMesh, PNDF):
     maskings = ("ggx_fit", "analytic", "beckmann", "none")
     roughness_keys = ("data",)
     bytes_per_texel = 80.0
-    integrates_lights = True
+    integrates_lights = finds_environment = True
 
     #: Elements of the same map, for queries with a light's spread or the half vector's turn, with
     #: derivatives or without; None until :meth:`prepare_for_lights`.

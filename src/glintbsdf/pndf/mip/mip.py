@@ -90,7 +90,7 @@ class Mip(PNDF):
     Raises :class:`~.ParameterError`.
     """
 
-    integrates_lights = True
+    integrates_lights = finds_environment = True
     maskings = ("footprint", "beckmann", "none")
 
     def __init__(
