@@ -21,7 +21,6 @@ COMMANDS = (
     "cost",
     "front",
     "gpu",
-    "manifold",
     "projected_area",
     "energy",
     "mip",

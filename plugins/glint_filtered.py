@@ -74,9 +74,9 @@ is. The averages come from a MIP chain of the moments that the filter needs:
         between texels does not count :cite:`RTR4`, section 9.13.1
 
 The mean normal of a footprint moves the lobe away from the geometric normal. The sampler draws
-visible normals. From a standard deviation of 1.2 texels on, the moments are accurate to 1 %
-(``python -m benchmarks accuracy moments``). Smaller footprints mix the moments of the texels, as
-texture filtering does, and look rougher than the interpolated normals.
+visible normals. From a standard deviation of 1.2 texels on, the moments are accurate to 1 %.
+Smaller footprints mix the moments of the texels, as texture filtering does, and look rougher than
+the interpolated normals.
 
 The material is one-sided and reflects only: use the ``twosided`` adapter for both sides. It works
 inside ``normalmap``, ``bumpmap``, ``blendbsdf`` and ``mask`` as well. The shape needs UV

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -97,6 +98,17 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GLINTBSDF_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _own_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Methods and modules with plugins that a test brings are known to no other test."""
+    from glintbsdf.bridge import registration
+    from glintbsdf.pndf import base
+
+    monkeypatch.setattr(base, "_methods", base.methods())
+    monkeypatch.setattr(registration, "_added", list(registration._added))
+    sys.modules.pop("waves", None)
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Errors of P-NDFs and of moments that error_vs_time does not measure.
+"""Errors of P-NDFs that error_vs_time does not measure.
 
 Beside an error, every part prints the noise of the reference: the relative L1 difference of an
 exact density.
@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, partial
 
-import mitsuba as mi
 import numpy as np
 
 from benchmarks.cases import PLACES, Ellipse, grid_of_normals, maps_of
 from benchmarks.harness import Run, family
 from benchmarks.measures import pndf as errors
-from glintbsdf import Footprint, NormalMap
+from glintbsdf import NormalMap
 from glintbsdf.check.reference import binned_pndf
-from glintbsdf.check.truth import slope_moments
 from glintbsdf.footprint.kernels import KERNELS
 from glintbsdf.pndf import Filtered, Manifold
 
@@ -115,52 +113,4 @@ def hand_over(run: Run) -> None:
                 table.measure({"map": name, "sigma": sigma}, work)
 
 
-#: Standard deviations of footprints, texels: equal to levels, between levels, and stretched.
-FOOTPRINTS = (
-    *((sigma, sigma) for sigma in (0.5, 1, 2**0.5, 8, 16, 1.2, 3.4, 7, 27)),
-    *((3, 2), (4, 2), (8, 2), (16, 2), (30, 1.5)),
-)
-
-
-def moment_errors(
-    make: Callable[[], NormalMap], major: float, minor: float, count: int
-) -> dict[str, float]:
-    """Errors of LEAN's moments for ``count`` random footprints with these axes (texels)."""
-    normal_map = make()
-    size = np.array([normal_map.width, normal_map.height])
-    rng = np.random.default_rng(3)
-    angle = rng.uniform(0, np.pi, count)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    axes, uv = turn.transpose(2, 0, 1) * [major, minor], rng.random((count, 2))
-    du, dv = np.float32(axes / size[:, None]).transpose(2, 1, 0)
-    footprint = Footprint(mi.Point2f(np.float32(uv.T)), mi.Vector2f(du), mi.Vector2f(dv))
-    averages = Filtered(normal_map, "lean").pyramid.average(footprint)
-    x, y, xx, yy, xy = (np.array(v, np.float64) for v in averages)  # a mean and a covariance
-    got = np.stack([x, y, xx + x * x, yy + y * y, xy + x * y], axis=1)
-    error = np.abs(got - slope_moments(normal_map, uv, axes))
-    mean_square = (np.linalg.norm(normal_map.roughness()) ** 2) / 2
-    first, second = error[:, :2] / mean_square**0.5, error[:, 2:] / mean_square
-    return {
-        f"{name}_{figure}": float(value)
-        for name, e in (("first", first), ("second", second))
-        for figure, value in (("rms", np.sqrt((e**2).mean())), ("max", e.max()))
-    }
-
-
-def moments(run: Run) -> None:
-    """Means and mean squares of slopes of LEAN's lobe against sums over the map's mesh, in float64.
-
-    Footprints are random. Errors are relative to the map's root mean square slope, and to its
-    square.
-    """
-    names = ("isotropic", "brushed", "leather", "scratched", "flakes")
-    size, count = (128, 4) if run.quick else (512, 24)
-    with run.table("moments") as table:
-        for name, make in maps_of(run, size, *names).items():
-            for major, minor in FOOTPRINTS:
-                key = {"map": name, "major": major, "minor": minor}
-                work = partial(moment_errors, make, major, minor, count)
-                table.measure(key, work)
-
-
-accuracy = family("accuracy", exact, hand_over, moments)
+accuracy = family("accuracy", exact, hand_over)

@@ -6,6 +6,7 @@ with fewer queries, and it says which. On a GPU it takes less than 8 minutes.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from contextlib import contextmanager
 from functools import cache, partial
@@ -109,7 +110,10 @@ def agreement(run: Run) -> None:
 
 
 def frozen(pndf, m: mi.Vector2f, footprint: Footprint) -> Callable:
-    """``pndf.eval(m, footprint)`` as a frozen function of these arrays, recorded once."""
+    """``pndf.eval(m, footprint)`` as a frozen function of these arrays, recorded here.
+
+    Dr.Jit (1.5) aborts if Python collects garbage with arrays made of NumPy's while it records.
+    """
     dr.eval(pndf.eval(m, footprint))  # whatever is made at the first use
     arrays = arrays_in(pndf)
 
@@ -117,6 +121,12 @@ def frozen(pndf, m: mi.Vector2f, footprint: Footprint) -> Callable:
     def evaluate(m, uv, du, dv):
         return pndf.eval(m, Footprint(uv, du, dv))
 
+    gc.collect()
+    gc.disable()
+    try:
+        dr.eval(evaluate(m, footprint.uv, footprint.du, footprint.dv))
+    finally:
+        gc.enable()
     return lambda *_: evaluate(m, footprint.uv, footprint.du, footprint.dv)
 
 

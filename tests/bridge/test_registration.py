@@ -113,12 +113,9 @@ WAVES = Path(__file__).parents[2] / "docs" / "examples"
 
 @pytest.fixture
 def waves(variant, monkeypatch):
-    """The module of the page "Write your own P-NDF", which Python finds; later nobody knows it."""
+    """The module of the page "Write your own P-NDF", which Python finds."""
     monkeypatch.syspath_prepend(WAVES)
-    yield "waves"
-    registration._added.clear()
-    sys.modules.pop("waves", None)
-    base._methods.pop("waves", None)
+    return "waves"
 
 
 def test_plugins_of_others_survive_changes_of_variant(waves, variant):

@@ -20,7 +20,7 @@ from glintbsdf.footprint.query import Query
 from glintbsdf.pndf.manifold.mesh import TexelMesh
 from glintbsdf.pndf.manifold.projected_area import (
     MANY_QUADS,
-    ORDERS,
+    ORDER,
     Corners,
     GgxFit,
     ProjectedArea,
@@ -136,9 +136,9 @@ KINDS = [
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_triangles(variant, kind):
-    # Relative error ≤ 1e-3 of every triangle, however little of it is visible, down to P = 1e-6,
-    # where float32 has lost the digits of the visible corner. Measured: 7e-4 with the low orders,
-    # where they are used, 4e-4 with the high one.
+    # The error of every triangle, however little of it is visible, down to P = 1e-6, where float32
+    # has lost the digits of the visible corner. Measured: 5.5e-4, and 4.7e-3 if normals are far
+    # apart.
     rng = np.random.default_rng(KINDS.index(kind))
     count = 1000
     w = random_directions(rng, count).astype(np.float32).astype(np.float64)
@@ -151,19 +151,18 @@ def test_triangles(variant, kind):
     assert seen.sum() > count / 3
     partly = seen & (np.array(corners.lowest) < 0)
     assert kind.startswith("size 0.0") or partly.sum() > count / 10
-    for limit, order in ORDERS:
-        whole = mean_facing(
-            corners.q,
-            corners.z,
-            (corners.chords[0], corners.chords[2], corners.chords[1]),
-            w_z,
-            order,
-        )
-        clipped = np.array(clipped_mean(corners, w_z, order))
-        used = seen & (longest <= limit)
-        for value, where in ((clipped, used), (np.array(whole), used & ~partly)):
-            error = np.abs(value[where] / expected[where] - 1)
-            assert (error <= 1e-3).all(), (order, error.max())
+    whole = mean_facing(
+        corners.q,
+        corners.z,
+        (corners.chords[0], corners.chords[2], corners.chords[1]),
+        w_z,
+        ORDER,
+    )
+    clipped = np.array(clipped_mean(corners, w_z, ORDER))
+    allowed = np.where(longest <= 0.8, 1e-3, 7e-3)
+    for value, where in ((clipped, seen), (np.array(whole), seen & ~partly)):
+        error = np.abs(value[where] / expected[where] - 1)
+        assert (error <= allowed[where]).all(), error.max()
     assert not (expected > 0)[~np.array(corners.may_be_seen(w_z))].any()
 
 

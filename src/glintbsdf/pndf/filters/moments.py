@@ -12,9 +12,9 @@ its major axis, as in texture hardware (Heckbert, "Fundamentals of Texture Mappi
 Warping", 1989; McCormack et al., "Feline: Fast Elliptical Lines for Anisotropic Texture Mapping",
 SIGGRAPH 1999).
 
-``python -m benchmarks accuracy moments`` measures the accuracy. Footprints narrower than a texel
-mix in the texels themselves. Their mean squares exceed those of the interpolated normals, so these
-footprints are the least accurate.
+Footprints narrower than a texel mix in the texels themselves. Their mean squares exceed those of
+the interpolated normals, so these footprints are the least accurate
+(tests/pndf/filters/test_moments.py).
 
 Positions are in texels: texel (row i, column j) has its centre at (j, i).
 """
