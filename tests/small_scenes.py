@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 _SQUARE = """<scene version="3.0.0">
-    <default name="plugin" value="glint_manifold"/>
+    <default name="plugin" value="{plugin}"/>
     <default name="integrator" value="path"/>
     <default name="depth" value="{depth}"/>
     <default name="size" value="16"/>
@@ -49,6 +49,7 @@ def square(
     rfilter: str = "box",
     spp: int = 16,
     depth: int = 2,
+    plugin: str = "glint_manifold",
 ) -> str:
     """A scene in XML: a square of 2 × 2 with the map ``map.exr``, from above, under a white sky.
 
@@ -60,9 +61,11 @@ def square(
         fov: field of view, degrees.
         origin: where the camera is.
         rfilter: the film's filter.
-        spp, depth: the values of these parameters by default.
+        spp, depth, plugin: the values of these parameters by default.
     """
-    return _SQUARE.format(more=more, fov=fov, origin=origin, rfilter=rfilter, spp=spp, depth=depth)
+    return _SQUARE.format(
+        more=more, fov=fov, origin=origin, rfilter=rfilter, spp=spp, depth=depth, plugin=plugin
+    )
 
 
 def ball(x: float, y: float, z: float, radius: float) -> str:

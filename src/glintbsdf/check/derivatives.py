@@ -106,7 +106,7 @@ def examples() -> dict[str, tuple[dict, tuple[str, ...], dict]]:
         "elements": (elements, ("sigma_r", *sizes, "data"), {}),
         "elements, lamp": (elements, ("sigma_r", "data"), lamp),
         "manifold": ({**manifold, **metal}, (*sizes, *of_metal), {}),
-        "manifold, map": (manifold, ("data",), {**lamp, "spp": 256}),
+        "manifold, map": (manifold, ("data",), {**lamp, "spp": 128}),
         "tables": (tables, ("footprint_sigma",), {}),
         "lean": (lean, ("alpha", *sizes, "data", *of_metal), {}),
         "diffuse": (diffuse, ("data", "footprint_sigma", "reflectance.value"), {}),
@@ -116,7 +116,7 @@ def examples() -> dict[str, tuple[dict, tuple[str, ...], dict]]:
         "grid": (
             grid,
             ("alpha_u", "alpha_v", "intensity", "eta", reflectance),
-            {"patterns": True, "seeds": 16},
+            {"patterns": True, "seeds": 8},
         ),
     }
     return {

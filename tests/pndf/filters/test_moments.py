@@ -113,7 +113,7 @@ def test_footprint_of_many_maps_shows_the_mean(variant):
     for name, normal_map in MAPS.items():
         chain = pyramid(normal_map)
         far = averages(chain, [[0.1, 0.7], [0.3, -8.2]], np.array([np.eye(2) * 5000] * 2))
-        near = slope_moments(normal_map, [[0.5, 0.5]], np.array([np.eye(2) * 60]))
+        near = slope_moments(normal_map, [[0.5, 0.5]], np.array([np.eye(2) * 40]))
         first, second = relative_errors(normal_map, far, np.repeat(near, 2, axis=0))
         assert first.max() < 0.005 and second.max() < 0.01, name
 

@@ -34,7 +34,7 @@ which are sorted by normal, are of no use here; see :class:`ProjectedArea`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from math import inf, sqrt
 
 import drjit as dr
@@ -81,6 +81,7 @@ HORIZON = 1e-15
 # ------------------------------------------------------------------------------------------------
 
 
+@cache
 def gauss(order: int) -> list[tuple[float, float]]:
     """Nodes and weights of the Gauss-Legendre rule on [0, 1]."""
     nodes, weights = np.polynomial.legendre.leggauss(order)
