@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +24,9 @@ from glintbsdf.core import tuning
 
 # Besides the variant of the run: several wavelengths per ray, one channel, Mueller matrices.
 OTHER_COLOURS = ("spectral", "mono", "spectral_polarized")
+
+#: Folders of tests that compute more than they read and write.
+COMPUTING = ("bridge", "check", "footprint", "lights", "microfacet", "plugins", "pndf")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -98,6 +102,18 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GLINTBSDF_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _one_thread(request: pytest.FixtureRequest) -> None:
+    """With a process on each core, a second thread in each only takes time from the others.
+
+    Mitsuba hangs when it reads or writes OpenEXR files with one thread.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = request.path.relative_to(Path(__file__).parent).parts[0]
+        several = folder not in COMPUTING or request.node.get_closest_marker("openexr")
+        dr.set_thread_count(2 if several else 1)
 
 
 @pytest.fixture(autouse=True)

@@ -83,6 +83,7 @@ def test_to_uv(variant):
             parameters(to_uv=transform).to_uv()
 
 
+@pytest.mark.openexr
 def test_map_from_a_relative_file_name(variant, tmp_path, monkeypatch):
     mi.Bitmap(np.full((4, 6, 2), 0.1, np.float32)).write(str(tmp_path / "map.exr"))
     resolver = mi.FileResolver(mi.file_resolver())

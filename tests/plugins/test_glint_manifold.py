@@ -272,6 +272,7 @@ def test_xml_and_dict_agree(variant, tmp_path):
     assert dr.allclose(weight, weight_xml, rtol=1e-4)
 
 
+@pytest.mark.openexr
 def test_all_sources_give_the_same_map(variant, tmp_path):
     normals = np.concatenate(
         [

@@ -236,6 +236,7 @@ def test_new_data_make_a_new_map(variant):
     )
 
 
+@pytest.mark.openexr
 def test_the_scene_renders_its_glints(variant):
     scenes = Path(__file__).parents[2] / "scenes"
     small = {"resx": "24", "resy": "24", "spp": "4", "output_size": "300"}

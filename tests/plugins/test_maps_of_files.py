@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+import pytest
 
 from glintbsdf import maps
 
@@ -25,6 +26,7 @@ def picture(bsdf: dict) -> np.ndarray:
     return np.array(mi.render(scene, spp=32, seed=1))[..., 0]
 
 
+@pytest.mark.openexr
 def test_a_float_map_stored_from_zero_to_one(variant, tmp_path):
     """As in Poly Haven, Blender and Mitsuba's ``normalmap``: the image is not black."""
     xy = maps.isotropic(64, alpha=0.1, correlation_length=8).normals.astype(np.float64)

@@ -29,6 +29,7 @@ def filename(tmp_path, variant) -> str:
     return str(tmp_path / "map.exr")
 
 
+@pytest.mark.openexr
 @pytest.mark.parametrize("plugin", STRUCTURES)
 def test_two_materials_of_a_map(filename, plugin):
     structures = STRUCTURES[plugin]
@@ -55,6 +56,7 @@ def test_two_materials_of_a_map(filename, plugin):
         assert of_a is not of_b
 
 
+@pytest.mark.openexr
 def test_structures_go_with_their_last_material(filename):
     a, b = (mi.load_dict({"type": "glint_filtered", "filename": filename}) for _ in range(2))
     pyramid, normal_map = weakref.ref(a.pndf.pyramid), weakref.ref(a.normal_map)
@@ -66,6 +68,7 @@ def test_structures_go_with_their_last_material(filename):
     assert pyramid() is None and normal_map() is None
 
 
+@pytest.mark.openexr
 def test_a_file_that_has_changed_is_another_map(filename, variant):
     first = NormalMap.load(filename)
     assert NormalMap.load(filename) is first is not NormalMap.load(filename, strength=2.0)

@@ -116,7 +116,7 @@ def examples() -> dict[str, tuple[dict, tuple[str, ...], dict]]:
         "grid": (
             grid,
             ("alpha_u", "alpha_v", "intensity", "eta", reflectance),
-            {"patterns": True, "seeds": 8},
+            {"patterns": True, "seeds": 16},
         ),
     }
     return {
