@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from itertools import cycle
 
 import drjit as dr
 import mitsuba as mi
@@ -23,17 +24,18 @@ METHODS = [
 ]
 
 
-def a_map(size: int = 64) -> np.ndarray:
-    """A map that no earlier run has used, as kernels are kept on disk.
+#: Roughness and size of bumps (texels), of the first map, the second, and so on.
+BUMPS = ((0.05, 9), (0.3, 3), (0.15, 5))
 
-    All maps have about the same slopes, as quadratures and levels of tables depend on them.
-    """
-    rng = np.random.default_rng()
-    alpha, length = rng.uniform(0.09, 0.11), rng.uniform(5, 7)
-    seed = int(rng.integers(1 << 30))
-    return maps.isotropic(
-        size, alpha=float(alpha), correlation_length=float(length), seed=seed
-    ).normals
+
+def a_map(size: int = 64) -> np.ndarray:
+    """A map that no earlier run has used, as kernels are kept on disk; flat and steep in turn."""
+    alpha, length = next(bumps)
+    seed = int(np.random.default_rng().integers(1 << 30))
+    return maps.isotropic(size, alpha=alpha, correlation_length=length, seed=seed).normals
+
+
+bumps = cycle(BUMPS)
 
 
 def plate(plugin: str, options: dict, size: int = 64, wrapped: bool = False) -> mi.Scene:
