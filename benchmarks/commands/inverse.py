@@ -93,7 +93,7 @@ def ratio(bsdf: dict, key: str, integrator: str, repetitions: int) -> dict:
     if integrator == "direct":
         description["integrator"] |= {"emitter_samples": 1, "bsdf_samples": 0}
     scene = mi.load_dict(description)
-    grown = Grown(scene, [key])
+    grown = Grown.of_plate(scene, [key])
     (name,) = grown.names.values()
 
     def forward(seed: int) -> object:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.commands.inverse import example
+from benchmarks.commands.inverse import example, ratio
+from glintbsdf.check.derivatives import examples
 
 
 @pytest.fixture
@@ -30,3 +31,10 @@ def test_pictures_under_all_lamps_at_once_are_those_of_renderings(inverse):
     rendered = inverse.Photographer(scene, lamps).pictures(spp=16)
     for ours, theirs in zip(at_once, rendered, strict=True):
         assert np.abs(ours / theirs[..., 0] - 1).max() < 0.05
+
+
+def test_an_iteration_is_timed(variant):
+    bsdf, keys, _ = examples()["lean"]
+    row = ratio(bsdf, keys[0], "direct", repetitions=1)
+    assert row["parameter"] == keys[0]
+    assert row["forward, s"] > 0 and row["iteration over forward"] > 0
