@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import os
 import re
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -118,13 +117,12 @@ def _one_thread(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture(autouse=True)
 def _own_methods(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Methods and modules with plugins that a test brings are known to no other test."""
+    """Methods and modules of plugins that a test registers are known to no other test."""
     from glintbsdf.bridge import registration
     from glintbsdf.pndf import base
 
     monkeypatch.setattr(base, "_methods", base.methods())
     monkeypatch.setattr(registration, "_added", list(registration._added))
-    sys.modules.pop("waves", None)
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,9 @@
-"""Lobes of glint_mip (Tan22): seams and repetition of the map that is made of a sample's patches.
+"""Lobes of glint_mip (Tan22): the blend of their levels, and the seams of the map.
 
-The samples have 256² texels. ``error_vs_time`` measures errors, times and memory for numbers of
-lobes and values of C_P; ``front`` measures building.
+The samples have 256² texels, the maps 2048². Footprints are round and w = 2σ texels wide.
+Differences are relative L1 differences on a grid of 128² normals over the range of the map's
+normals, with σ_r = 0.005. ``error_vs_time`` measures errors, times and memory for numbers of lobes
+and values of C_P; ``front`` measures building.
 """
 
 from __future__ import annotations
@@ -9,13 +11,84 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from benchmarks.cases import SYNTHESIS, maps_of
+from benchmarks.cases import (
+    PLACES,
+    SYNTHESIS,
+    Ellipse,
+    grid_of_normals,
+    maps_of,
+)
 from benchmarks.harness import Run, family
+from benchmarks.methods import SIGMA_R
 from glintbsdf import NormalMap
+from glintbsdf.check import suite
 from glintbsdf.check.stiff import white_noise
 from glintbsdf.maps.quilting import lobe_features, synthesise
+from glintbsdf.pndf import Mip
+
+RES = 128
+
+
+class NearestLevel(Mip):
+    """Lobes without interpolation between levels."""
+
+    def level(self, kernel):
+        below, above, fraction = super().level(kernel)
+        nearest = dr.select(fraction < 0.5, below, above)
+        return nearest, nearest, mi.Float(0)
+
+
+def samples_of(run: Run) -> dict[str, Callable[[], NormalMap]]:
+    """The samples to make maps from."""
+    return maps_of(run, 256, *("isotropic", "scratched")[: 1 if run.quick else 2], seed=3)
+
+
+def all_normals(normal_map: NormalMap) -> mi.Vector2f:
+    """A grid of normals over the range of the map's normals."""
+    normals = normal_map.normals.reshape(-1, 2)
+    return grid_of_normals((normals.min(axis=0), normals.max(axis=0)), RES)
+
+
+def density_at(pndf, uv: tuple, width: float, m: mi.Vector2f) -> np.ndarray:
+    """The P-NDF of a footprint ``width`` texels across."""
+    footprint = Ellipse.round(width / 2).at(pndf.normal_map, np.array(uv)[:, None])
+    return pndf.eval(m, footprint).numpy()
+
+
+def largest_jump(pndf: Mip, widest: float) -> dict:
+    """The largest relative L1 change while the footprint grows by 1 % from 16 texels on."""
+    m, before, jumps = all_normals(pndf.normal_map), None, []
+    for width in 16 * 1.01 ** np.arange(0, np.log(widest / 16) / np.log(1.01)):
+        now = density_at(pndf, PLACES[0], width, m)
+        jumps += [] if before is None else [suite.relative_l1(now, before)]
+        before = now
+    return {"largest_jump": max(jumps)}
+
+
+def interpolation(run: Run) -> None:
+    """The largest change of the P-NDF while the footprint grows by 1 % (Fig. 14).
+
+    Two levels are blended, or only the nearest one is used. Expected: jumps as large as the error,
+    0.2, without interpolation, and below 0.02 with it.
+    """
+    size, widest = (1024, 32) if run.quick else (2048, 128)
+    with run.table("interpolation") as table:
+        for sample, make in samples_of(run).items():
+            for levels, kind in (("blended", Mip), ("nearest", NearestLevel)):
+                options = {"output_size": size, "sigma_r": SIGMA_R}
+                table.measure(
+                    {"sample": sample, "levels": levels},
+                    lambda kind=kind, make=make, o=options: largest_jump(kind(make(), **o), widest),
+                )
+
+
+# --------------------------------------------------------------------------------------------------
+#  Seams
+# --------------------------------------------------------------------------------------------------
 
 
 def seam(run: Run, make: Callable[[], NormalMap], sample: str, patch: int, overlap: int) -> dict:
@@ -81,4 +154,4 @@ def seams(run: Run) -> None:
                 table.measure(key, partial(seam, run, make, **key))
 
 
-mip = family("mip", seams)
+mip = family("mip", interpolation, seams)

@@ -25,7 +25,7 @@ METHODS = [
 
 
 #: Roughness and size of bumps (texels), of the first map, the second, and so on.
-BUMPS = ((0.05, 9), (0.3, 3), (0.15, 5))
+bumps = cycle([(0.05, 9), (0.3, 3), (0.15, 5)])
 
 
 def a_map(size: int = 64) -> np.ndarray:
@@ -33,9 +33,6 @@ def a_map(size: int = 64) -> np.ndarray:
     alpha, length = next(bumps)
     seed = int(np.random.default_rng().integers(1 << 30))
     return maps.isotropic(size, alpha=alpha, correlation_length=length, seed=seed).normals
-
-
-bumps = cycle(BUMPS)
 
 
 def plate(plugin: str, options: dict, size: int = 64, wrapped: bool = False) -> mi.Scene:

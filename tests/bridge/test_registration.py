@@ -115,6 +115,7 @@ WAVES = Path(__file__).parents[2] / "docs" / "examples"
 def waves(variant, monkeypatch):
     """The module of the page "Write your own P-NDF", which Python finds."""
     monkeypatch.syspath_prepend(WAVES)
+    monkeypatch.delitem(sys.modules, "waves", raising=False)  # it registers when it is imported
     return "waves"
 
 

@@ -97,6 +97,7 @@ def folder(tmp_path, variant, monkeypatch) -> Path:
     (tmp_path / "scene.xml").write_text(SCENE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(ROOT / "docs/examples")
+    monkeypatch.delitem(sys.modules, "waves", raising=False)  # it registers when it is imported
     return tmp_path
 
 

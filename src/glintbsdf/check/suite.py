@@ -176,7 +176,7 @@ def density(bsdf: mi.BSDF, view: View, s: mi.Vector2f) -> mi.Float:
 
 
 def mass_in_bins(
-    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 8, repetitions: int = 6
+    bsdf: mi.BSDF, view: View, bounds: Bounds, res: int, points: int = 12, repetitions: int = 8
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mass of D in each of ``res``² bins over ``bounds``, and the standard error of the quadrature.
 

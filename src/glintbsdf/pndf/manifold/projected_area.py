@@ -359,10 +359,9 @@ FEW_QUADS = 25
 #: measures the error).
 MANY_QUADS = 4096
 
-#: Order of the Gauss rule. The relative error of any triangle is then below 1e-3, and below 7e-3 if
-#: two of its unit normals are more than 0.8 apart (tests/pndf/manifold/test_projected_area.py). It
-#: is the same for all maps, as they share kernels.
-ORDER = 3
+#: Order of the Gauss rule. The relative error of any triangle is then below 1e-3
+#: (tests/pndf/manifold/test_projected_area.py). It is the same for all maps, as they share kernels.
+ORDER = 4
 
 
 class FootprintArea:
