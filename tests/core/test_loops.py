@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from glintbsdf.core.loops import Captured, symbolic_loop
+from glintbsdf.core.loops import Captured, add_where, symbolic_loop
 
 TURNS = 5
 
@@ -87,8 +87,23 @@ def by_nested_loop(x):
     return count_and_add(inner, mi.Float(0)) - sum(range(TURNS)) * y
 
 
+def by_branches(x):
+    """Σ k x² over the turns of two branches; one of them is inside of another."""
+    y = x * x
+
+    def even(k):
+        return add_where(k * y, dr.square(k) > 9, lambda: (k - 3) * y, True)
+
+    def term(k):
+        is_even = (mi.UInt32(k) & 1) == 0
+        total = add_where(mi.Float(0), is_even, lambda: even(k), True)
+        return add_where(total, ~is_even, lambda: k * y, True)
+
+    return count_and_add(term, mi.Float(0)) - (TURNS - 1 - 3) * y
+
+
 FORMS = [by_variable, by_vector, by_matrix, by_object, by_method, by_interaction, by_partial,
-         by_default, by_function, by_nested_loop]  # fmt: skip
+         by_default, by_function, by_nested_loop, by_branches]  # fmt: skip
 FACTOR = sum(range(TURNS))
 
 

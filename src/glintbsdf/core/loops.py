@@ -19,6 +19,7 @@ from types import CellType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 
 def symbolic_loop(state: tuple, condition: Callable, body: Callable, label: str) -> tuple:
@@ -80,8 +81,15 @@ def frozen(thing: Any, done: dict) -> Any:
 
 
 def derivatives_exist() -> bool:
-    """Whether any array has derivatives. Otherwise no search for them is needed, which takes a
-    fourth of the time to record a kernel."""
+    """Whether any array has derivatives that are recorded here. Otherwise no search for them is
+    needed, which takes a fourth of the time to record a kernel."""
+    fresh = mi.Float(0)
+    dr.enable_grad(fresh)
+    if not dr.grad_enabled(fresh):
+        return False  # within a block of dr.suspend_grad
+    if fresh.index_ad > 1:
+        return True  # Dr.Jit takes the smallest number that is free, and counts from 1
+    del fresh
     table = dr.whos_ad(True)  # titles between lines, and a line for each variable
     return table is None or len(table.split()) > EMPTY_TABLE
 
@@ -319,20 +327,23 @@ WAYS: dict[type, Callable] = {
 
 
 def add_where(density, condition, added, active):
-    """``density + added()`` in the lanes where the condition holds, by a branch.
-
-    With derivatives there is no branch: Dr.Jit (1.5) cannot record them through a branch in a loop.
-    """
-    if dr.grad_enabled(added()):
-        return density + dr.select(condition, added(), 0)
-    return dr.if_stmt(
-        (density,), active & condition, lambda density: density + added(), lambda density: density
-    )
+    """``density + added()`` in the lanes where the condition holds, by a branch."""
+    return where_needed(active & condition, lambda sum: (sum + added(),), (density,))[0]
 
 
 def where_needed(needed, added, sums: tuple) -> tuple:
-    """``added(*sums)`` in the lanes that need it, and ``sums`` in all others; by a branch, under
-    the same condition as in :func:`add_where`."""
-    if dr.grad_enabled(added(*sums)):
-        return tuple(dr.select(needed, a, b) for a, b in zip(added(*sums), sums, strict=True))
-    return dr.if_stmt(sums, needed, added, lambda *sums: sums)
+    """``added(*sums)`` in the lanes that need it, and ``sums`` in all others; by a branch.
+
+    ``added`` only adds to the sums. In loops, Dr.Jit (1.5) cannot record derivatives through a
+    branch, but it can through an inner loop whose sums begin with zero. So the branch is a loop of
+    one turn where derivatives are recorded.
+    """
+    if not derivatives_exist():
+        return dr.if_stmt(sums, needed, added, lambda *sums: sums)
+
+    def once(needed, *sums):
+        return needed & False, *added(*sums)
+
+    state = (mi.Bool(needed), *(dr.zeros(type(sum)) for sum in sums))
+    found = symbolic_loop(state, lambda needed, *_: needed, once, "branch")[1:]
+    return tuple(a + b for a, b in zip(sums, found, strict=True))

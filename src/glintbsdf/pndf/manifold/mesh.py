@@ -143,16 +143,16 @@ def quad_density(m, corner, kernel, normals, epsilon, active):
         return kernel.value(u) * dr.abs(inverse)
 
     def hit():
-        density = term(
+        return term(
             in_upper | in_lower,
             dr.select(in_upper, u_upper, u_lower),
             dr.select(in_upper, inverse_upper, inverse_lower),
         )
-        return add_where(
-            density, in_upper & in_lower, lambda: term(in_lower, u_lower, inverse_lower), active
-        )
 
     density = add_where(mi.Float(0), in_upper | in_lower, hit, active)
+    density = add_where(
+        density, in_upper & in_lower, lambda: term(in_lower, u_lower, inverse_lower), active
+    )
 
     def degenerate():
         a, e1, e2 = equilateral(epsilon)
