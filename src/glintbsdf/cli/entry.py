@@ -6,7 +6,6 @@ This module has only the parts that concern the terminal; other modules do the w
 
 from __future__ import annotations
 
-import re
 import shlex
 import sys
 from pathlib import Path
@@ -28,6 +27,7 @@ from glintbsdf.cli.render_options import (
     replaces_integrator,
 )
 from glintbsdf.cli.render_options import options as render_options
+from glintbsdf.core.errors import one_line
 from glintbsdf.core.interruption import interruptible
 from glintbsdf.core.progress import progress
 from glintbsdf.examples import EXAMPLES
@@ -59,18 +59,6 @@ def main() -> NoReturn:
         if debug:
             raise
         sys.exit(f"Error: {one_line(str(error)) or type(error).__name__}")
-
-
-def one_line(message: str) -> str:
-    """Return an error message without the Python traceback, the class of the error and the place
-    in Mitsuba's sources.
-
-    Mitsuba wraps the error of a Python plugin in its own message, with all of these.
-    """
-    message = re.sub(r"^\[\w+\.cpp:\d+\] ", "", message)
-    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+", "", message)
-    message = re.sub(r"(?<=: )[\w.]*Error: ", "", message)
-    return " ".join(message.split())
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

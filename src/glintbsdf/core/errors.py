@@ -1,10 +1,11 @@
-"""The one sentence that reports a wrong parameter.
+"""The one sentence that reports a wrong parameter, or any other error.
 
 It names the plugin, the parameter, the allowed values, and the given one.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 
@@ -50,3 +51,15 @@ def check_whole(
     """Raise :class:`ParameterError` unless ``value`` is a whole number that ``fits``."""
     fitting = isinstance(value, int) and not isinstance(value, bool) and fits(value)
     check(fitting, owner, parameter, f"a whole number {requirement}", value)
+
+
+def one_line(message: str) -> str:
+    """Return an error message without the Python traceback, the class of the error and the place
+    in Mitsuba's sources.
+
+    Mitsuba wraps the error of a Python plugin in its own message, with all of these.
+    """
+    message = re.sub(r"^\[\w+\.cpp:\d+\] ", "", message)
+    message = re.sub(r"Traceback \(most recent call last\):\n(?:  .*\n)+", "", message)
+    message = re.sub(r"(?<=: )[\w.]*Error: ", "", message)
+    return " ".join(message.split())
