@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -132,6 +133,36 @@ def test_quick_start_is_two_commands():
     assert all(command.startswith("python3 -m venv .venv && ") for command in commands)
     for scene in re.findall(r"scenes/\S+\.xml", readme):
         assert (ROOT / scene).exists()
+
+
+@pytest.mark.parametrize(
+    "remote",
+    [
+        "https://forge.example/owner/name.git",
+        "https://user:secret@forge.example/owner/name",
+        "git@forge.example:owner/name.git",
+        "ssh://git@forge.example/owner/name.git",
+    ],
+)
+def test_the_package_page_shows_pictures(remote):
+    setup = runpy.run_path(str(ROOT / "setup.py"))
+    repository = setup["public_address"](remote)
+    assert repository == "https://forge.example/owner/name"
+    readme = (ROOT / "README.md").read_text()
+    page = setup["with_addresses"](readme, repository)
+    pictures, links = (
+        re.findall(rf"{before}\[[^]]*\]\((.*?)\)", page) for before in ("!", "(?<!!)")
+    )
+    for addresses, kind in ((pictures, "raw"), (links, "blob")):
+        own = [a for a in addresses if a.startswith(f"{repository}/{kind}/HEAD/")]
+        assert own and all((ROOT / a.split("/HEAD/")[1]).exists() for a in own)
+        assert all(a.startswith("https://") for a in addresses)
+
+
+def test_a_package_that_is_built_from_a_folder_has_the_readme_as_it_is():
+    setup = runpy.run_path(str(ROOT / "setup.py"))
+    for folder in ("/srv/glintbsdf", "../glintbsdf.git", "user@host:glintbsdf", ""):
+        assert setup["public_address"](folder) is None
 
 
 def test_python_example_of_the_readme_runs(tmp_path, variant, monkeypatch):
