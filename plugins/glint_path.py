@@ -31,7 +31,7 @@ Mitsuba's path tracer, in which glints know the size of a pixel at every bounce.
  * - pixel_share
    - |string| or |float|
    - Share of the pixel filter's variance that footprints carry, in [0, 1]; they are placed with the
-     rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 up to 12
+     rest of the variance. 0 is sampling alone. (Default: :monosp:`auto`, which is 1 up to 16
      samples per pixel, and then falls slowly with their number; with a :monosp:`box` filter it
      falls from 4 samples on, and faster)
 

@@ -66,11 +66,12 @@ def material(plugin: dict, file: Path) -> dict:
 
 def memory() -> tuple[float, float]:
     """The largest and the present memory of this process, GiB."""
-    resident = 0.0
     if sys.platform == "linux":
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        resident = pages * os.sysconf("SC_PAGE_SIZE") / 2**30
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, resident
+        # What getrusage() returns as the largest is that of the process that started this one.
+        status = Path("/proc/self/status").read_text()
+        kib = {line.split()[0]: line.split()[1] for line in status.splitlines() if "kB" in line}
+        return int(kib["VmHWM:"]) / 2**20, int(kib["VmRSS:"]) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**30, 0.0
 
 
 def child(variant: str, plugin: dict, file: Path) -> dict:

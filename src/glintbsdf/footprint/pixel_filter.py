@@ -33,7 +33,7 @@ LEAST_VARIANCE = 1e-3
 
 #: Samples per pixel up to which footprints carry the whole filter, and the same for a filter that
 #: drops to zero at its ends.
-WHOLE_SAMPLES, WHOLE_SAMPLES_ABRUPT = 12, 4
+WHOLE_SAMPLES, WHOLE_SAMPLES_ABRUPT = 16, 4
 
 
 def automatic_share(samples: int, abrupt: bool) -> float:
