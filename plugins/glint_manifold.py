@@ -40,7 +40,7 @@ A surface with the normals of a map, each of which glints exactly as the map has
      1e-4. Within a bin D is constant, so finer or shifted bins have a larger error where many
      facets have almost the same normal, as in maps of flakes. The error is predicted from the
      footprint, and from errors that are measured on the map when the tables are built;
-     ``python -m benchmarks manifold tables`` compares it with the true error. Each level of the
+     the method ``measured_error`` of its ``pndf`` compares it with the true one. Each level of the
      tables takes up to 62 MiB; all levels, with the lists for small footprints, take up to 190 MiB.
      There is no blending: where a growing footprint changes to tables, or to the next level, D
      jumps by less than this error. Samples have exactly the density D. With :monosp:`wrap_mode`

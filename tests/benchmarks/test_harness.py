@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import import_module
 from pathlib import Path
 
@@ -97,3 +98,20 @@ def test_methods_of_the_register_take_part():
         assert entry.plugin in {setting.plugin for setting in stiff.STIFF.values()}
     names = [method.name for method in methods.METHODS]
     assert len(set(names)) == len(names)
+
+
+def test_commands_that_pages_name_exist():
+    folders = ("src", "plugins", "docs", "benchmarks")
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.*")]
+    files = [f for f in files if f.suffix in (".py", ".rst", ".md") and "_build" not in f.parts]
+    named: set[tuple[str, str]] = set()
+    for file in [*files, ROOT / "README.md"]:
+        words = r"(?:-m |``)benchmarks ([a-z_]+)(?: ([a-z_]+))?"
+        named |= set(re.findall(words, file.read_text(encoding="utf-8")))
+    assert len(named) > 8
+    for command, part in named:
+        known = benchmarks.get_command(None, command)
+        assert known is not None, command
+        choices = known.params[0].type
+        if part and hasattr(choices, "choices"):
+            assert part in choices.choices, (command, part)

@@ -64,10 +64,11 @@ class Derivative:
 
 
 #: Integrators whose derivatives are right, and the arguments of :func:`render_derivatives` that it
-#: takes to see them: ``prb_basic`` finds lights by samples of the BSDF only.
+#: takes to see them: ``prb_basic`` finds lights by samples of the BSDF only, and short steps drown
+#: in its noise.
 INTEGRATORS: dict[str, dict] = {
     "prb": {},
-    "prb_basic": {"lamp": "sphere", "spp": 256, "seeds": 8},
+    "prb_basic": {"lamp": "sphere", "spp": 256, "seeds": 8, "step": STEP},
     "direct": {},
     "path": {},
     "glint_path": {},

@@ -64,7 +64,7 @@ def widening(cut: mi.Float) -> mi.Float:
 
 #: The level of a query is the coarsest at which a footprint's minor standard deviation spans about
 #: this many cells,
-CELLS_PER_SIGMA = 2.5
+CELLS_PER_SIGMA = 3.0
 
 #: and the normals change by about this multiple of the light's spread from cell to cell,
 NORMALS_PER_SPREAD = 2.0

@@ -59,9 +59,8 @@ class TabulatedManifold(Manifold):
         max_error (float): largest relative L1 error of the P-NDF, > 0. It is an error of the masses
             in the bins of the tables, whose size is 1/128 of the range of the map's normals, and at
             least 1e-4. Within a bin D is constant, so the error in finer or shifted bins is larger.
-            The predicted error is at most ``max_error``; ``python -m benchmarks manifold tables``
-            compares it with the measured one. Footprints for which no level is accurate enough are
-            evaluated exactly.
+            The predicted error is at most ``max_error``; :meth:`measured_error` is the true one.
+            Footprints for which no level is accurate enough are evaluated exactly.
         domain: as in :class:`Manifold`; there are no tables where all footprints are exact.
 
     A map with ``wrap_mode`` ``clamp`` is always evaluated exactly. There is no blending between
