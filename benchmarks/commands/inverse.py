@@ -86,7 +86,7 @@ def cost(run: Run) -> None:
     nearly all of the time: Mitsuba evaluates it seven times where ``prb`` goes back, and twice
     where it goes forward.
     """
-    methods = {"roughconductor": (ROUGH, ("alpha",)), **examples()}
+    methods = {"roughconductor": (ROUGH, ("alpha.value",)), **examples()}
     with run.table("cost") as table:
         for method, (bsdf, keys, *_) in methods.items():
             for integrator in ("direct", "prb"):
