@@ -98,7 +98,7 @@ def measure(row: Row) -> dict:
             row.parameter not in WIDTHS or WIDTHS[row.parameter](row.value) >= NARROWEST_LOBE
         ),
     }
-    if method.plugin == "glint_grid":
+    if isinstance(bsdf.pndf, Grid):
         measured["mean"] = lambda: robustness.mean_of_grid(bsdf, 1 << 16)
     if method.double:
         measured["double"] = lambda: robustness.double_error(bsdf, load, 4 * method.lanes)

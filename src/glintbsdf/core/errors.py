@@ -1,6 +1,6 @@
-"""The one sentence that reports a wrong parameter, or any other error.
+"""Errors in one sentence.
 
-It names the plugin, the parameter, the allowed values, and the given one.
+That of a wrong parameter names the plugin, the parameter, the allowed values, and the given one.
 """
 
 from __future__ import annotations

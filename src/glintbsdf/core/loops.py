@@ -88,7 +88,7 @@ def derivatives_exist() -> bool:
     if not dr.grad_enabled(fresh):
         return False  # within a block of dr.suspend_grad
     if fresh.index_ad > 1:
-        return True  # Dr.Jit takes the smallest number that is free, and counts from 1
+        return True  # Dr.Jit (1.5) takes the smallest number that is free, and counts from 1
     del fresh
     table = dr.whos_ad(True)  # titles between lines, and a line for each variable
     return table is None or len(table.split()) > EMPTY_TABLE
@@ -328,7 +328,7 @@ WAYS: dict[type, Callable] = {
 
 def add_where(density, condition, added, active):
     """``density + added()`` in the lanes where the condition holds, by a branch."""
-    return where_needed(active & condition, lambda sum: (sum + added(),), (density,))[0]
+    return where_needed(active & condition, lambda total: (total + added(),), (density,))[0]
 
 
 def where_needed(needed, added, sums: tuple) -> tuple:
@@ -344,6 +344,6 @@ def where_needed(needed, added, sums: tuple) -> tuple:
     def once(needed, *sums):
         return needed & False, *added(*sums)
 
-    state = (mi.Bool(needed), *(dr.zeros(type(sum)) for sum in sums))
+    state = (mi.Bool(needed), *(dr.zeros(type(total)) for total in sums))
     found = symbolic_loop(state, lambda needed, *_: needed, once, "branch")[1:]
     return tuple(a + b for a, b in zip(sums, found, strict=True))
